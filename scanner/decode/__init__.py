@@ -1,0 +1,108 @@
+"""Frames to projector rows: the contract of every decoder, and the one that fits a pattern.
+
+A decoder is given frames one at a time, in any order, as they arrive; what is left to do after the last one is
+small. It knows the pattern and the camera's format, and neither devices nor calibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.errors import DecodeError
+from scanner.patterns import CameraFormat, McpPattern, PatternSequence, PmpPattern
+
+Map = NDArray[np.float32]
+"""(H, W) float32, NaN where undecided"""
+
+
+class Reason(IntEnum):
+    """Why a pixel has no value (formats.md, Scan)."""
+
+    VALUE = 0
+    SHADOW = 1
+    CLIPPED = 2
+    LOW_MODULATION = 3
+    UNWRAP_RISK = 4
+    BORDER = 5
+    OUT_OF_STEP = 6
+    MOVED = 7
+    FILTERED = 8
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """What a decoder found, on the camera's pixel grid (H, W). Invalid is NaN.
+
+    rows and columns are projector coordinates seen at the pixel's centre, px; None where the axis was not
+    projected. sigma_*: expected 1-sigma of their random error, px. confidence: 0..1, the estimated probability
+    that the value is no wrong stripe or fringe. albedo, modulation: A and B in grey levels.
+    """
+
+    rows: Map | None
+    columns: Map | None
+    sigma_rows: Map | None
+    sigma_columns: Map | None
+    confidence: Map
+    albedo: Map
+    modulation: Map
+    reason: NDArray[np.uint8]
+    stripes: NDArray[np.int16] | None = None
+    """MCP: index of the decoded stripe at the pixel nearest to its peak, -1 elsewhere"""
+    peaks: NDArray[np.float32] | None = None
+    """MCP: (M, 5) x, y, projector row or column, stripe index, confidence"""
+    warnings: tuple[str, ...] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)
+    """counts, thresholds and figures for report.json, plain data"""
+
+
+class Decoder(Protocol):
+    """One scan's decoder."""
+
+    def add(self, position: int, frame: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+        """Take the frame at `position` of the pattern's frame list. The array is not kept.
+
+        Raises:
+            DecodeError: wrong size or dtype, or a position that was given before.
+        """
+
+    def finish(self) -> Decoded:
+        """The maps, after the last frame.
+
+        Raises:
+            DecodeError: too few frames, or frames that contradict the description.
+        """
+
+
+def decoder_for(sequence: PatternSequence, camera: CameraFormat, name: str = "default") -> Decoder:
+    """The decoder for a pattern.
+
+    Args:
+        sequence: what was projected.
+        camera: the frames' format.
+        name: "default", or a decoder of that method by name.
+
+    Raises:
+        DecodeError: no such decoder for this method.
+    """
+    # Imported on demand: a program that decodes PMP does not pay for MCP's kernels.
+    if name != "default":
+        raise DecodeError(
+            f"no decoder {name!r} for method {sequence.pattern.method!r}", hint="leave --decoder out for the default"
+        )
+    if isinstance(sequence.pattern, PmpPattern):
+        from scanner.decode.pmp import PmpDecoder  # noqa: PLC0415
+
+        return PmpDecoder(sequence, camera)
+    if isinstance(sequence.pattern, McpPattern):
+        from scanner.decode.mcp import McpDecoder  # noqa: PLC0415
+
+        return McpDecoder(sequence, camera)
+    from scanner.decode.graycode import GrayDecoder  # noqa: PLC0415
+
+    return GrayDecoder(sequence, camera)

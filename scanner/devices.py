@@ -1,0 +1,330 @@
+"""The contracts between the sequencer and devices: what a projector, a camera and a trigger board can do.
+
+A driver implements one of the small protocols below and declares what its device can do (`capabilities`);
+nothing is guessed. Times are CLOCK_MONOTONIC nanoseconds, each with a source and a bound. Calls come from one
+thread at a time; a call may block, which is why devices live in a process of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+class Source(StrEnum):
+    """Where a time stamp comes from."""
+
+    HARDWARE = "hardware"
+    """latched by the device or the kernel at the event itself"""
+    DRIVER = "driver"
+    """taken by a driver near the event, with a bound that holds"""
+    ESTIMATED = "estimated"
+    """computed or taken late: the bound is a belief"""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A measured duration, ns: it lies in [low_ns, high_ns]."""
+
+    low_ns: int
+    high_ns: int
+
+    def __post_init__(self) -> None:
+        if self.low_ns > self.high_ns:
+            raise ValueError(f"interval is upside down: {self.low_ns} > {self.high_ns}")
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """When a frame was exposed: first row's start to last row's end (so rolling readout is inside), ns."""
+
+    start_ns: int
+    end_ns: int
+    bound_ns: int
+    """each of the two times is true within +- bound_ns"""
+    source: Source
+
+
+@dataclass(frozen=True)
+class Flip:
+    """When scan-out of an image began, ns. Light follows after the projector's latency."""
+
+    t_ns: int
+    vblank: int
+    """the display's own count of vertical blanks"""
+    bound_ns: int
+    source: Source
+
+
+# --- projectors -------------------------------------------------------------------------------------------------
+
+
+class ProjectorKind(StrEnum):
+    """The three kinds of projector."""
+
+    STATIC = "static"
+    """a slide, or a pattern that stays on"""
+    FRAMEBUFFER = "framebuffer"
+    """one image per refresh or per `dwell` refreshes: HDMI, V4L2 output, a window"""
+    SEQUENCER = "sequencer"
+    """runs a table of slots by itself: pattern-mode controllers"""
+
+
+@dataclass(frozen=True)
+class ProjectorCapabilities:
+    """What a projector can do. Unmeasured is None, never a guess."""
+
+    kind: ProjectorKind
+    width: int
+    height: int
+    refresh_ns: int
+    """period of the vertical blank"""
+    modulation_period_ns: int | None = None
+    """a grey is built over this time (colour wheel, bit planes); None: the light is constant"""
+    latency: Interval | None = None
+    """from the flip's stamp to the change of light at the first row that changes"""
+    settle: Interval | None = None
+    """from then until every row shows the new image"""
+    scan: Literal["global", "rows"] = "global"
+    trigger_outputs: frozenset[Literal["frame", "exposure"]] = frozenset()
+
+
+@runtime_checkable
+class Projector(Protocol):
+    """A display that the host flips: `static` and `framebuffer`. Opened by its driver's `open_projector`."""
+
+    @property
+    def name(self) -> str:
+        """The device's name in messages."""
+
+    @property
+    def capabilities(self) -> ProjectorCapabilities:
+        """What it can do."""
+
+    def load(self, images: Sequence[Image]) -> None:
+        """Replace the images in the device's memory, before a run. images: (height, width) uint8 each.
+
+        Raises:
+            DeviceError: wrong size or no room.
+        """
+
+    def show(self, index: int) -> Flip:
+        """Flip to loaded image `index` at the next vertical blank; returns once it happened.
+
+        Raises:
+            DeviceLost: the display went away.
+        """
+
+    def close(self) -> None:
+        """Leave a black screen and give the device back. May be called twice."""
+
+
+@dataclass(frozen=True)
+class TableSlot:
+    """One slot of a projector's or trigger board's own table."""
+
+    image: int
+    exposure_us: int
+    dark_us: int
+    bit_planes: int = 8
+    colour: Literal["white", "red", "green", "blue"] = "white"
+    wait_trigger: bool = False
+    emit_trigger: bool = True
+
+
+@runtime_checkable
+class SequencedProjector(Projector, Protocol):
+    """A projector that runs a table of slots by itself and says when each began."""
+
+    def program(self, table: Sequence[TableSlot]) -> None:
+        """Load the table, after `load` and before `start`."""
+
+    def start(self) -> None:
+        """Run the table once."""
+
+    def flips(self) -> Sequence[Flip]:
+        """Starts of the slots run so far, in order."""
+
+
+# --- cameras ----------------------------------------------------------------------------------------------------
+
+
+class TriggerMode(StrEnum):
+    """What starts an exposure."""
+
+    FREE = "free"
+    SOFTWARE = "software"
+    HARDWARE = "hardware"
+
+
+@dataclass(frozen=True)
+class CameraCapabilities:
+    """What a camera can do, in its present region and pixel format."""
+
+    width: int
+    height: int
+    bits: int
+    """significant bits a pixel, right-aligned"""
+    shutter: Literal["global", "rolling"]
+    readout_ns: int
+    """rolling: first row's start to last row's start; global: duration of the transfer"""
+    exposure_min_ns: int
+    exposure_max_ns: int
+    exposure_step_ns: int
+    min_gap_ns: int
+    """shortest time from the end of one exposure to the start of the next; see `min_period_ns`"""
+    trigger_modes: frozenset[TriggerMode]
+    trigger_latency: Interval | None = None
+    """software trigger call to first row's start"""
+    stamp: Source = Source.ESTIMATED
+    stamp_bound_ns: int = 1_000_000
+    gain_min_db: float = 0.0
+    gain_max_db: float = 0.0
+    mosaic: str | None = None
+
+    @property
+    def max_value(self) -> int:
+        """Largest grey level."""
+        return (1 << self.bits) - 1
+
+    def min_period_ns(self, exposure_ns: int) -> int:
+        """Shortest time between the starts of two exposures, ns."""
+        return exposure_ns + self.min_gap_ns
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """What a camera is told before a run. None leaves the device's value."""
+
+    exposure_ns: int | None = None
+    gain_db: float | None = None
+    pixel_format: str | None = None
+    region: tuple[int, int, int, int] | None = None
+    """x, y, width, height in sensor pixels"""
+
+
+@dataclass(frozen=True)
+class CameraFrame:
+    """One frame as the camera delivered it.
+
+    `pixels` are lent: valid until the next `pop` or `stop` of the camera; whoever needs them longer copies them.
+    """
+
+    pixels: Pixels
+    """(height, width) uint8 or uint16, right-aligned, C-contiguous"""
+    frame_id: int
+    """the device's own count, as it gave it (may wrap)"""
+    exposure: Exposure
+    complete: bool = True
+    trigger: int | None = None
+    """number of the trigger that started it, where the device counts them"""
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """A camera. Opened by its driver's `open_camera`, with automatic functions off."""
+
+    @property
+    def name(self) -> str:
+        """The device's name in messages."""
+
+    @property
+    def capabilities(self) -> CameraCapabilities:
+        """What it can do with the settings last applied."""
+
+    def apply(self, settings: CameraSettings) -> CameraSettings:
+        """Set and read back, while stopped. Returns what the device took.
+
+        Raises:
+            ConfigError: a value outside the capabilities, named with its bounds.
+        """
+
+    def start(self, mode: TriggerMode) -> None:
+        """Begin to acquire; frames from before are gone."""
+
+    def trigger(self) -> None:
+        """Start one exposure now (mode SOFTWARE). A camera that is busy drops it, as real ones do."""
+
+    def pop(self, timeout_ns: int) -> CameraFrame | None:
+        """The next frame, oldest first; None if none came in `timeout_ns`.
+
+        Raises:
+            DeviceLost: the camera went away.
+        """
+
+    def stop(self) -> None:
+        """End acquisition. May be called twice."""
+
+    def close(self) -> None:
+        """Give the device back. May be called twice."""
+
+
+# --- trigger boards ---------------------------------------------------------------------------------------------
+
+
+class TriggerSource(StrEnum):
+    """What a board's table waits for."""
+
+    INTERNAL = "INT"
+    VSYNC = "VSYNC"
+    EXTERNAL = "EXT"
+
+
+@dataclass(frozen=True)
+class TriggerEvent:
+    """One exposure pulse that a board gave."""
+
+    sequence: int
+    step: int
+    t_ns: int
+    bound_ns: int
+    source: Source
+
+
+@runtime_checkable
+class TriggerBoard(Protocol):
+    """A board that runs a table of exposures on its own timer; the host never times a frame."""
+
+    @property
+    def name(self) -> str:
+        """The device's name in messages."""
+
+    def program(self, table: Sequence[TableSlot], source: TriggerSource) -> None:
+        """Load the whole table."""
+
+    def arm(self) -> None:
+        """Wait for the source."""
+
+    def fire(self) -> None:
+        """Start the table now (source INTERNAL)."""
+
+    def abort(self) -> None:
+        """Stop, outputs low."""
+
+    def events(self) -> Sequence[TriggerEvent]:
+        """Pulses given since `arm`, in order."""
+
+    def close(self) -> None:
+        """Give the device back. May be called twice."""
+
+
+# --- drivers ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """One device that a driver can see, for `fringed devices`."""
+
+    driver: str
+    device: str
+    kind: Literal["camera", "projector", "trigger"]
+    model: str
+    details: dict[str, Any]

@@ -1,0 +1,199 @@
+"""Pinhole cameras and projectors with distortion, and the calibration file that holds a rig's pair of them.
+
+A projector is an inverse camera: the same model, its image being what it shows. Image coordinates are OpenCV's:
+the centre of the top-left pixel is (0, 0). Lengths in mm. X_projector = rotation @ X_camera + translation.
+Distortion is Brown's (1966) with OpenCV's order k1, k2, p1, p2, k3. Triangulation is in `scanner.triangulation`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.errors import CalibrationError
+
+Array = NDArray[np.float64]
+
+FORMAT = "fringed-calibration"
+VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """One side of the rig: size (width, height) px, matrix (3, 3), distortion (5,)."""
+
+    size: tuple[int, int]
+    matrix: Array
+    distortion: Array
+
+    def normalised(self, points: NDArray[Any]) -> Array:
+        """Pixel coordinates to undistorted directions.
+
+        Args:
+            points: (..., 2) x, y in px.
+
+        Returns:
+            (..., 2) float64: x / z, y / z of the ray, distortion removed by iteration to 1e-9.
+        """
+        flat = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 1, 2)
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
+        rays = cv2.undistortPointsIter(flat, self.matrix, self.distortion, np.eye(3), np.eye(3), criteria)
+        return np.asarray(rays, dtype=np.float64).reshape(np.shape(points))
+
+    def project(self, points: NDArray[Any]) -> Array:
+        """Points in this lens's own frame to its pixels.
+
+        Args:
+            points: (..., 3) mm, z > 0.
+
+        Returns:
+            (..., 2) float64 px, distortion applied.
+        """
+        p = np.asarray(points, dtype=np.float64)
+        x, y = p[..., 0] / p[..., 2], p[..., 1] / p[..., 2]
+        k1, k2, p1, p2, k3 = self.distortion
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        m = self.matrix
+        return np.stack((m[0, 0] * xd + m[0, 1] * yd + m[0, 2], m[1, 1] * yd + m[1, 2]), axis=-1)
+
+    def pixel_grid(self) -> Array:
+        """(H, W, 2) float64: x, y of every pixel's centre."""
+        width, height = self.size
+        x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+        return np.stack((x, y), axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What is known of a rig's geometry (formats.md, Calibration). `extra` keeps the optional members as read."""
+
+    camera: Lens
+    projector: Lens
+    rotation: Array
+    """(3, 3)"""
+    translation: Array
+    """(3,) mm"""
+    id: str = ""
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_projector(self, points: NDArray[Any]) -> Array:
+        """(..., 3) mm in the camera's frame to (..., 3) mm in the projector's."""
+        return np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
+
+    @property
+    def projector_centre(self) -> Array:
+        """(3,) mm: the projector's centre of projection in the camera's frame."""
+        centre: Array = -self.rotation.T @ self.translation
+        return centre
+
+    @property
+    def phase_axis(self) -> str:
+        """"y" where the baseline runs along the projector's rows' direction, else "x": the axis that measures depth.
+
+        The projected coordinate has to change with depth: along a camera ray the projector's image point moves
+        along an epipolar line, and the axis it moves along more is the one to project.
+        """
+        w, h = self.camera.size
+        ray = np.append(self.camera.normalised(np.array([(w - 1) / 2, (h - 1) / 2])), 1.0)
+        depth = max(float(np.linalg.norm(self.projector_centre)) * 4.0, 1.0)
+        near, far = (self.projector.project(self.to_projector(ray * z)) for z in (depth, depth * 1.05))
+        moved = np.abs(far - near)
+        return "y" if moved[1] >= moved[0] else "x"
+
+    def as_dict(self) -> dict[str, Any]:
+        """The calibration as formats.md writes it."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "id": self.id,
+            "units": "mm",
+            **self.extra,
+            "camera": _lens_dict(self.camera),
+            "projector": _lens_dict(self.projector),
+            "rotation": self.rotation.tolist(),
+            "translation": self.translation.tolist(),
+        }
+
+
+def load_calibration(path: Path) -> Calibration:
+    """Read a calibration file.
+
+    Raises:
+        CalibrationError: unreadable, of another format or version, or not a geometry (NaN, singular, mirrored).
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CalibrationError(f"cannot read calibration {path}: {error.strerror}") from error
+    except (ValueError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"{path} is not JSON: {error}") from error
+    return calibration_from_dict(content, name=str(path))
+
+
+def calibration_from_dict(content: Any, name: str = "calibration") -> Calibration:
+    """Check and take a calibration given as plain data; `name` is used in messages.
+
+    Raises:
+        CalibrationError: see `load_calibration`.
+    """
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise CalibrationError(f"{name}: not a {FORMAT} file", hint='its "format" member says what a file is')
+    version = content.get("version")
+    if version != VERSION:
+        raise CalibrationError(
+            f"{name}: version {version!r} of {FORMAT}, this program reads version {VERSION}",
+            hint="update fringed, or write the file again with this one",
+        )
+    lenses = {side: _lens(content.get(side), f"{name}: {side}") for side in ("camera", "projector")}
+    rotation = _matrix(content.get("rotation"), (3, 3), f"{name}: rotation")
+    translation = _matrix(content.get("translation"), (3,), f"{name}: translation")
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
+        raise CalibrationError(f"{name}: rotation is not a rotation (orthonormal, determinant +1)")
+    if np.linalg.norm(translation) < 1e-9:
+        raise CalibrationError(f"{name}: translation is zero: projector and camera cannot stand at the same place")
+    known = {"format", "version", "id", "camera", "projector", "rotation", "translation"}
+    extra = {key: value for key, value in content.items() if key not in known}
+    return Calibration(**lenses, rotation=rotation, translation=translation, id=str(content.get("id", "")), extra=extra)
+
+
+def _lens_dict(lens: Lens) -> dict[str, Any]:
+    return {"size": list(lens.size), "matrix": lens.matrix.tolist(), "distortion": lens.distortion.tolist()}
+
+
+def _lens(content: Any, name: str) -> Lens:
+    if not isinstance(content, dict):
+        raise CalibrationError(f"{name} is missing")
+    size = content.get("size")
+    if not (isinstance(size, list) and len(size) == 2 and all(isinstance(n, int) and n > 0 for n in size)):
+        raise CalibrationError(f"{name}.size must be [width, height] in pixels, got {size!r}")
+    matrix = _matrix(content.get("matrix"), (3, 3), f"{name}.matrix")
+    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or abs(np.linalg.det(matrix)) < 1e-9:
+        raise CalibrationError(f"{name}.matrix is singular or has a focal length that is not positive")
+    if np.abs(matrix[1, 0]) > 0 or np.abs(matrix[2] - (0, 0, 1)).max() > 0:
+        raise CalibrationError(f"{name}.matrix must be upper triangular with last row 0 0 1")
+    distortion = _matrix(content.get("distortion", [0.0] * 5), (5,), f"{name}.distortion")
+    return Lens((size[0], size[1]), matrix, distortion)
+
+
+def _matrix(content: Any, shape: tuple[int, ...], name: str) -> Array:
+    if content is None:
+        raise CalibrationError(f"{name} is missing")
+    try:
+        array = np.asarray(content, dtype=np.float64)
+    except (ValueError, TypeError) as error:
+        raise CalibrationError(f"{name} is not an array of numbers") from error
+    if array.shape != shape:
+        raise CalibrationError(f"{name} has shape {array.shape}, expected {shape}")
+    if not np.isfinite(array).all():
+        raise CalibrationError(f"{name} contains NaN or infinity")
+    return array

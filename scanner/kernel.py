@@ -1,0 +1,26 @@
+"""How hot loops are compiled: one place for numba's options.
+
+A kernel is a plain function over arrays. It releases the interpreter lock, is compiled once and cached beside
+its source, and has a plain NumPy form in its test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numba
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+
+def kernel(function: _F) -> _F:
+    """Compile `function` for one thread, cached, without the interpreter lock."""
+    compiled: _F = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    return compiled
+
+
+def parallel_kernel(function: _F) -> _F:
+    """Compile `function` for all threads (`numba.prange`), cached, without the interpreter lock."""
+    compiled: _F = numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")(function)
+    return compiled

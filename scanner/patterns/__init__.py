@@ -1,0 +1,27 @@
+"""The images to project, as data: descriptions (formats.md, Pattern descriptions) and the images they stand for."""
+
+from scanner.patterns.description import (
+    Axis,
+    CameraFormat,
+    FrameRole,
+    Pattern,
+    ProjectorSize,
+    pattern_from_description,
+)
+from scanner.patterns.graycode import GrayPattern
+from scanner.patterns.mcp import McpPattern
+from scanner.patterns.pmp import PmpPattern
+from scanner.patterns.sequence import PatternSequence
+
+__all__ = [
+    "Axis",
+    "CameraFormat",
+    "FrameRole",
+    "GrayPattern",
+    "McpPattern",
+    "Pattern",
+    "PatternSequence",
+    "PmpPattern",
+    "ProjectorSize",
+    "pattern_from_description",
+]
