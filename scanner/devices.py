@@ -7,13 +7,16 @@ thread at a time; a call may block, which is why devices live in a process of th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+
+from scanner.clock import Clock
+from scanner.geometry import Calibration
 
 Image = NDArray[np.uint8]
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
@@ -328,3 +331,66 @@ class DeviceInfo:
     kind: Literal["camera", "projector", "trigger"]
     model: str
     details: dict[str, Any]
+
+
+class CameraDriver(Protocol):
+    """What an entry point of the group `fringed.cameras` names."""
+
+    def open(self, device: str, options: Mapping[str, Any], clock: Clock) -> Camera:
+        """Open one camera. device: the rig file's string ("" = the first); options: the driver's own table.
+
+        Raises:
+            ConfigError: device or options make no sense to this driver.
+            DeviceNotFound, DeviceBusy, PermissionDenied: it cannot be opened; the hint says what to do.
+        """
+
+    def discover(self) -> Sequence[DeviceInfo]:
+        """The cameras this driver can see now. A missing library is an empty list, not an error."""
+
+
+class ProjectorDriver(Protocol):
+    """What an entry point of the group `fringed.projectors` names."""
+
+    def open(self, device: str, options: Mapping[str, Any], clock: Clock) -> Projector:
+        """Open one projector; see `CameraDriver.open`."""
+
+    def discover(self) -> Sequence[DeviceInfo]:
+        """The projectors this driver can see now."""
+
+
+class TriggerDriver(Protocol):
+    """What an entry point of the group `fringed.triggers` names."""
+
+    def open(self, device: str, options: Mapping[str, Any], clock: Clock) -> TriggerBoard:
+        """Open one trigger board; see `CameraDriver.open`."""
+
+    def discover(self) -> Sequence[DeviceInfo]:
+        """The boards this driver can see now."""
+
+
+# --- devices that know the truth ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a simulated scene really is, on the camera's pixel grid. NaN where the ray meets nothing.
+
+    rows, columns: (H, W) float32 projector coordinates of the seen surface point, px. xyz: (H, W, 3) float32 mm,
+    camera frame. lit: (H, W) bool, inside the projector's field and not in shadow.
+    """
+
+    rows: NDArray[np.float32]
+    columns: NDArray[np.float32]
+    xyz: NDArray[np.float32]
+    lit: NDArray[np.bool_]
+
+
+@runtime_checkable
+class KnowsTruth(Protocol):
+    """A camera that stands in a simulated world, and can tell what it should measure."""
+
+    def truth(self) -> Truth:
+        """The scene's truth."""
+
+    def true_calibration(self) -> Calibration:
+        """The rig's geometry, exact."""

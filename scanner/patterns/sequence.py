@@ -120,13 +120,15 @@ class PatternSequence:
         sentinels = description.get("sentinels") or []
         if not isinstance(sentinels, list | tuple):
             raise DecodeError(f'pattern member "sentinels" must be a list of positions, got {sentinels!r}')
+        for position in (*sentinels, *bars.values()):
+            _required_position(position, "sentinels or bars")
         return cls(
             projector,
             pattern,
             white=_position(description.get("white"), "white"),
             black=_position(description.get("black"), "black"),
-            sentinels=tuple(_required_position(p, "sentinels") for p in sentinels),
-            bars={axis: _required_position(p, "bars") for axis, p in bars.items()},
+            sentinels=tuple(p for p in sentinels if p not in bars.values()),
+            bars=dict(bars),
             precorrection=_precorrection(description.get("precorrection")),
         )
 
@@ -181,12 +183,16 @@ class PatternSequence:
         return np.rint(light * 255).astype(np.uint8)
 
     def describe(self) -> dict[str, Any]:
-        """The description of formats.md; `bars` is an addition of ours, absent where there are none."""
+        """The description of formats.md.
+
+        `bars` is an addition of ours, absent where there are none; their positions stand among the sentinels too, so
+        that a reader who does not know them takes the same frames for fringes.
+        """
         described: dict[str, Any] = {
             **self.pattern.describe(),
             "white": self.white,
             "black": self.black,
-            "sentinels": list(self.sentinels),
+            "sentinels": sorted((*self.sentinels, *self.bars.values())),
             "precorrection": self.precorrection.describe() if self.precorrection else None,
         }
         if self.bars:
