@@ -44,7 +44,7 @@ class Lens:
         """
         flat = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 1, 2)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
-        rays = cv2.undistortPointsIter(flat, self.matrix, self.distortion, np.eye(3), np.eye(3), criteria)
+        rays = cv2.undistortPoints(flat, self.matrix, self.distortion, None, None, None, criteria)
         return np.asarray(rays, dtype=np.float64).reshape(np.shape(points))
 
     def project(self, points: NDArray[Any]) -> Array:
@@ -98,7 +98,7 @@ class Calibration:
 
     @property
     def phase_axis(self) -> str:
-        """"y" where the baseline runs along the projector's rows' direction, else "x": the axis that measures depth.
+        """ "y" where the baseline runs along the projector's rows' direction, else "x": the axis that measures depth.
 
         The projected coordinate has to change with depth: along a camera ray the projector's image point moves
         along an epipolar line, and the axis it moves along more is the one to project.

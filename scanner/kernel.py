@@ -7,7 +7,7 @@ its source, and has a plain NumPy form in its test.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -16,11 +16,9 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 def kernel(function: _F) -> _F:
     """Compile `function` for one thread, cached, without the interpreter lock."""
-    compiled: _F = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    return compiled
+    return cast(_F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
 
 
 def parallel_kernel(function: _F) -> _F:
     """Compile `function` for all threads (`numba.prange`), cached, without the interpreter lock."""
-    compiled: _F = numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")(function)
-    return compiled
+    return cast(_F, numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")(function))

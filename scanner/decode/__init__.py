@@ -93,7 +93,8 @@ def decoder_for(sequence: PatternSequence, camera: CameraFormat, name: str = "de
     # Imported on demand: a program that decodes PMP does not pay for MCP's kernels.
     if name != "default":
         raise DecodeError(
-            f"no decoder {name!r} for method {sequence.pattern.method!r}", hint="leave --decoder out for the default"
+            f"no decoder {name!r} for method {sequence.pattern.method!r}",
+            hint="leave --decoder out for the default",
         )
     if isinstance(sequence.pattern, PmpPattern):
         from scanner.decode.pmp import PmpDecoder  # noqa: PLC0415

@@ -102,9 +102,7 @@ def pattern_from_description(description: Mapping[str, Any]) -> Pattern:
     methods: dict[str, Any] = {"pmp": PmpPattern, "mcp": McpPattern, "gray": GrayPattern}
     method = description.get("method")
     if method not in methods:
-        raise DecodeError(
-            f"unknown pattern method {method!r}", hint=f"known methods: {', '.join(sorted(methods))}"
-        )
+        raise DecodeError(f"unknown pattern method {method!r}", hint=f"known methods: {', '.join(sorted(methods))}")
     pattern: Pattern = methods[method].from_description(description)
     return pattern
 

@@ -27,7 +27,9 @@ class GrayPattern:
 
     def __post_init__(self) -> None:
         if not 1 <= self.bits <= self.code_bits <= 16:
-            raise DecodeError(f"bits must be 1 .. code_bits and code_bits at most 16, got {self.bits}, {self.code_bits}")
+            raise DecodeError(
+                f"bits must be 1 .. code_bits and code_bits at most 16, got {self.bits}, {self.code_bits}"
+            )
 
     @classmethod
     def from_description(cls, description: Mapping[str, Any]) -> GrayPattern:

@@ -33,7 +33,7 @@ MIN_CARRIER_SEPARATION = 4.0
 
 @dataclass(frozen=True)
 class McpPattern:
-    """Carriers in cycles per projector width (axis "y") or height (axis "x"); `codes[k]` is modulated stripe k's word."""
+    """Carriers in cycles per projector width (axis "y") or height ("x"); `codes[k]` is modulated stripe k's word."""
 
     axis: Axis = "y"
     bits: int = 4

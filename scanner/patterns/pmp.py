@@ -1,6 +1,6 @@
 """Phase measuring profilometry: sets of shifted sinusoidal fringes (Srinivasan, Liu, Halioua 1984).
 
-    I_n(y) = A + B cos(2 pi f (y + origin) / Y + sign 2 pi n / N + offset),     A = .5, B = .48 at projection
+I_n(y) = A + B cos(2 pi f (y + origin) / Y + sign 2 pi n / N + offset),     A = .5, B = .48 at projection
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ class Precorrection:
             value = np.power(light, 1 / self.gamma) * 255
         else:
             value = np.interp(light * 255, np.arange(256), np.asarray(self.table, dtype=np.float64))
-        return np.rint(value).astype(np.uint8)
+        return np.asarray(np.rint(value), dtype=np.uint8)
 
     def describe(self) -> dict[str, Any]:
         """The member of formats.md."""
@@ -229,7 +229,9 @@ def _precorrection(value: Any) -> Precorrection | None:
     if value is None:
         return None
     if not isinstance(value, Mapping):
-        raise DecodeError(f'pattern member "precorrection" must be null, {{"gamma": g}} or {{"table": [...]}}, got {value!r}')
+        raise DecodeError(
+            f'pattern member "precorrection" must be null, {{"gamma": g}} or {{"table": [...]}}, got {value!r}'
+        )
     gamma, table = value.get("gamma"), value.get("table")
     try:
         return Precorrection(
