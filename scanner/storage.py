@@ -1,0 +1,95 @@
+"""Writing files so that a crash at any moment leaves the old one or the new one, whole.
+
+Also: output folders that are refused unless empty, and room on the disk asked for before it is needed.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from scanner.errors import StorageError
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in `folder` last: fsync of the directory."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Write `content` to `path`: a temporary file beside it, fsync, rename, fsync of the folder.
+
+    Raises:
+        StorageError: the disk is full, or the folder cannot be written.
+    """
+    with storage_errors(path):
+        temporary = path.with_name(f".{path.name}.tmp")
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+        sync_folder(path.parent)
+
+
+def replace_json(path: Path, content: Any) -> None:
+    """Write plain data as JSON with `replace_file`."""
+    replace_file(path, (json.dumps(content, indent=1) + "\n").encode())
+
+
+def prepare_output(folder: Path, *, force: bool = False) -> Path:
+    """Make an output folder, or take one that is empty.
+
+    Raises:
+        StorageError: not a folder, not writable, or not empty and not `force`.
+    """
+    with storage_errors(folder):
+        if folder.exists() and not folder.is_dir():
+            raise StorageError(f"{folder} is a file, an output folder is needed", hint="give another -o DIR")
+        if folder.is_dir() and any(folder.iterdir()) and not force:
+            raise StorageError(f"{folder} is not empty", hint="give another -o DIR, or --force to write into it")
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise StorageError(f"{folder} is not writable", hint="give another -o DIR")
+    return folder
+
+
+def check_room(folder: Path, needed: int) -> None:
+    """Ask for `needed` bytes of free space under `folder`, or under its nearest existing parent.
+
+    Raises:
+        StorageError: there is less.
+    """
+    place = next(parent for parent in (folder, *folder.resolve().parents) if parent.exists())
+    free = shutil.disk_usage(place).free
+    if free < needed:
+        raise StorageError(
+            f"{folder} needs {needed / 1e6:.0f} MB, the disk has {free / 1e6:.0f} MB left",
+            hint="free some space, or give a folder on another disk",
+        )
+
+
+@contextmanager
+def storage_errors(path: Path) -> Iterator[None]:
+    """Turn the system's errors about `path` into StorageError with a hint."""
+    hints = {
+        errno.ENOSPC: "the disk is full: free some space",
+        errno.EDQUOT: "the quota is used up: free some space",
+        errno.EACCES: "this user may not write there",
+        errno.EROFS: "the file system is read-only",
+        errno.EMFILE: "too many open files: raise the limit (ulimit -n)",
+    }
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{path}: {error.strerror}", hint=hints.get(error.errno or 0)) from error
