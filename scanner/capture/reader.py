@@ -1,0 +1,207 @@
+"""A capture folder, opened to read: from here or from elsewhere, finished or interrupted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.capture.header import (
+    FRAMES_FILE,
+    HEADER_FILE,
+    MAX_PIXELS,
+    RECORDS_FILE,
+    CaptureHeader,
+    FrameRecord,
+    digest_matches,
+)
+from scanner.devices import Pixels
+from scanner.errors import DecodeError
+from scanner.patterns import CameraFormat
+
+
+class Capture:
+    """A capture folder, opened to read.
+
+    Frames are checked against their digests when first asked for; a slot that has no line, or whose digest differs,
+    does not exist.
+    """
+
+    def __init__(self, path: Path, header: CaptureHeader, records: Sequence[FrameRecord] | None) -> None:
+        self.path = path
+        self.header = header
+        self.all_records = tuple(records or ())
+        self._slots = None if header.frames is not None else _map_frames(path, header)
+        self._records = self._present(records)
+
+    @classmethod
+    def open(cls, path: Path) -> Capture:
+        """Open a folder (its capture.json) or a JSON file.
+
+        Raises:
+            DecodeError: missing, unreadable or contradictory, with what and where.
+        """
+        file = path / HEADER_FILE if path.is_dir() else path
+        try:
+            content = json.loads(file.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise DecodeError(
+                f"cannot read {file}: {error.strerror}", hint="give a capture folder or its capture.json"
+            ) from error
+        except ValueError as error:
+            raise DecodeError(f"{file} is not JSON: {error}") from error
+        header = CaptureHeader.from_dict(content, str(file))
+        records = _read_records(file.parent / RECORDS_FILE) if header.frames is None else None
+        return cls(file.parent, header, records)
+
+    @property
+    def records(self) -> Mapping[int, FrameRecord]:
+        """By pattern index: the last whole line of each pattern whose frame is here."""
+        return self._records
+
+    @property
+    def missing(self) -> tuple[int, ...]:
+        """Pattern indices of a whole capture that are not here."""
+        return tuple(index for index in range(self.header.frame_count) if index not in self._records)
+
+    @property
+    def calibration_path(self) -> Path | None:
+        """The calibration file the capture names, if it names a file.
+
+        Raises:
+            DecodeError: the name leads out of the folder.
+        """
+        name = self.header.calibration
+        return _inside(self.path, name) if name is not None and name.endswith(".json") else None
+
+    def frame(self, pattern: int) -> Pixels:
+        """The frame of a pattern index: (height, width) uint8 or uint16, a read-only view where possible.
+
+        Raises:
+            KeyError: not here.
+            DecodeError: unreadable, or of another size or depth than capture.json says.
+        """
+        slot = self._records[pattern].slot
+        if self.header.frames is not None:
+            return _read_image(_inside(self.path, self.header.frames[pattern]), self.header.camera)
+        if slot is None or self._slots is None:
+            raise KeyError(pattern)
+        frame: Pixels = self._slots[slot]
+        return frame
+
+    def _present(self, records: Sequence[FrameRecord] | None) -> dict[int, FrameRecord]:
+        count = self.header.frame_count
+        if self.header.frames is not None:
+            if len(self.header.frames) != count:
+                raise DecodeError(
+                    f"{self.path}: {len(self.header.frames)} frames listed, the pattern has {count}",
+                    hint="the pattern description and the frames contradict each other",
+                )
+            return {index: FrameRecord(index, index) for index in range(count)}
+        slots = self._slots
+        if slots is None:
+            return {}
+        if records is None:
+            if len(slots) != count:
+                raise DecodeError(
+                    f"{self.path / FRAMES_FILE}: {len(slots)} frames, the pattern has {count}",
+                    hint="the pattern description and the frames contradict each other",
+                )
+            return {index: FrameRecord(index, index) for index in range(count)}
+        last = {record.pattern: record for record in records if record.pattern < count}
+        return {
+            pattern: record
+            for pattern, record in sorted(last.items())
+            if record.status == "ok"
+            and record.slot is not None
+            and record.slot < len(slots)
+            and digest_matches(slots[record.slot], record.xxh3)
+        }
+
+
+def _read_records(path: Path) -> list[FrameRecord] | None:
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise DecodeError(f"cannot read {path}: {error.strerror}") from error
+    records = []
+    # A line without its newline was torn by a crash and says nothing; so is one that does not parse.
+    for line in content.split(b"\n")[:-1]:
+        try:
+            records.append(FrameRecord.from_dict(json.loads(line)))
+        except (ValueError, KeyError, TypeError):
+            continue
+    return records
+
+
+def _map_frames(folder: Path, header: CaptureHeader) -> NDArray[Any] | None:
+    path, camera = folder / FRAMES_FILE, header.camera
+    if not path.exists():
+        if header.state != "complete":
+            return None
+        raise DecodeError(f"{folder}: neither {FRAMES_FILE} nor a list of image files", hint="is the capture whole?")
+    shape, dtype, offset = _read_npy_header(path)
+    if shape[1:] != camera.shape:
+        raise DecodeError(
+            f"{path}: frames of {shape[2]} x {shape[1]}, capture.json says {camera.width} x {camera.height}"
+        )
+    if dtype != camera.dtype:
+        raise DecodeError(f"{path}: frames are {dtype}, {camera.bits} bits need {camera.dtype}")
+    frame_bytes = camera.width * camera.height * dtype.itemsize
+    whole = (path.stat().st_size - offset) // frame_bytes
+    slots = whole if header.state == "open" else shape[0]
+    if slots > whole:
+        raise DecodeError(
+            f"{path} is truncated: {shape[0]} frames announced, {whole} there",
+            hint="copy it again; an interrupted capture says state: open",
+        )
+    if slots == 0:
+        return None
+    return np.memmap(path, dtype=dtype, mode="r", offset=offset, shape=(slots, *camera.shape))
+
+
+def _read_npy_header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
+    try:
+        with path.open("rb") as file:
+            version = np.lib.format.read_magic(file)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, fortran, dtype = read(file)
+            offset = file.tell()
+    except (OSError, ValueError) as error:
+        raise DecodeError(f"{path} is not a NumPy array file: {error}") from error
+    if fortran or len(shape) != 3 or dtype not in (np.uint8, np.uint16) or shape[1] * shape[2] > MAX_PIXELS:
+        raise DecodeError(f"{path}: expected uint8 or uint16 of shape (slots, height, width), found {dtype} {shape}")
+    return shape, dtype, offset
+
+
+def _read_image(path: Path, camera: CameraFormat) -> Pixels:
+    if not path.is_file():
+        raise DecodeError(f"frame {path} is missing")
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise DecodeError(f"frame {path} cannot be read as an image", hint="PNG, TIFF, PGM or BMP, 8 or 16 bit")
+    if image.ndim == 3:
+        image = image[..., 0] if image.shape[2] == 1 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
+    if image.shape != camera.shape:
+        raise DecodeError(
+            f"frame {path} is {image.shape[1]} x {image.shape[0]}, capture.json says {camera.width} x {camera.height}"
+        )
+    if image.dtype != camera.dtype:
+        raise DecodeError(f"frame {path} is {image.dtype}, {camera.bits} bits need {camera.dtype}")
+    return np.asarray(image, dtype=camera.dtype)
+
+
+def _inside(folder: Path, name: str) -> Path:
+    path = (folder / name).resolve()
+    if not path.is_relative_to(folder.resolve()):
+        raise DecodeError(
+            f"{folder}: {name!r} leads out of the capture folder", hint="paths are relative to the folder"
+        )
+    return path
