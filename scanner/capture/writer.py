@@ -57,9 +57,16 @@ class CaptureWriter:
             flags = os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
             self._frames = os.open(folder / FRAMES_FILE, flags | os.O_RDWR, 0o640)
             self._records = os.open(folder / RECORDS_FILE, flags | os.O_WRONLY | os.O_APPEND, 0o640)
-            os.pwrite(self._frames, npy_header(0, camera), 0)
-            self._reserve(slots)
+        try:
+            with storage_errors(folder):
+                os.pwrite(self._frames, npy_header(0, camera), 0)
+                self._reserve(slots)
             replace_json(folder / HEADER_FILE, self.header.as_dict())
+        except StorageError:
+            self.abandon()
+            for name in (FRAMES_FILE, RECORDS_FILE):
+                (folder / name).unlink()
+            raise
 
     @property
     def frames_path(self) -> Path:
