@@ -1,0 +1,39 @@
+# Everyday commands of this clone. Each brings the set-up up to date first; `make help` lists them.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV
+export PYTHONNOUSERSITE := 1
+
+bin := .venv/bin
+ARGS ?=
+
+.PHONY: help setup scan test check bench docs clean
+
+help: ## this list
+	@sed -nE 's/^([a-z]+):.*## (.*)/make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
+
+setup: ## install what is missing, compile the kernels
+	@setup/install.sh
+
+scan: setup ## scan the simulated rig; ARGS="--method mcp" and the like are passed on
+	@setup/scan.sh $(ARGS)
+
+test: setup ## all tests; ARGS="-k config" and the like are passed on
+	@$(bin)/python -m pytest -q $(ARGS)
+
+check: ## format, lint, types, layers
+	@setup/install.sh --no-kernels
+	@$(bin)/ruff format --check .
+	@$(bin)/ruff check .
+	@$(bin)/mypy
+	@$(bin)/lint-imports
+
+bench: setup ## the benchmarks, one after the other
+	@for bench in bench/*.py; do echo "== $$bench"; $(bin)/python $$bench || exit 1; done
+
+docs: setup ## write the generated pages of the documentation anew
+	@$(bin)/python docs/generate.py
+
+clean: ## remove everything that set-up and tests made; scans are kept
+	rm -rf .venv .setup .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache build dist *.egg-info
+	find scanner drivers service tests bench docs -name __pycache__ -prune -exec rm -rf {} +

@@ -1,0 +1,121 @@
+"""Hygiene: a test that leaves a process, thread, socket or file behind fails.
+
+Every test runs in an empty working directory, with the session's own temporary directory; both must be as it found
+them when it ends. What fixtures of wider scope hold is there before and after, and is looked at when the session ends.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import stat
+import tempfile
+import threading
+import time
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+MARK = f"FRINGED_TEST_SESSION={uuid.uuid4()}"
+"""Inherited by every process that a test starts, also by those that left the family"""
+
+PATIENCE_S = 2.0
+"""Time for threads and processes that were told to end"""
+
+LONG_LIVED = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
+"""Helpers that Python keeps until it exits, by design"""
+
+
+@dataclass(frozen=True)
+class Traces:
+    """What a test can leave behind, by name."""
+
+    processes: frozenset[str]
+    threads: frozenset[str]
+    sockets: frozenset[str]
+    files: frozenset[str]
+
+    def beyond(self, before: Traces) -> list[str]:
+        """What is here and was not there before, in words."""
+        return [
+            f"{kind[:-1] if kind != 'processes' else 'process'} {name}"
+            for kind in ("processes", "threads", "sockets", "files")
+            for name in sorted(getattr(self, kind) - getattr(before, kind))
+        ]
+
+
+@pytest.fixture(scope="session")
+def places(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Path]]:
+    """The session's temporary directory and working directory; every process started here bears the mark."""
+    temporary, working = tmp_path_factory.mktemp("tmp"), tmp_path_factory.mktemp("cwd")
+    name, _, value = MARK.partition("=")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TMPDIR", str(temporary))
+        patch.setattr(tempfile, "tempdir", str(temporary))
+        patch.setenv(name, value)
+        patch.chdir(working)
+        yield temporary, working
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _clean_session(places: tuple[Path, Path]) -> Iterator[None]:
+    before = _traces(places)
+    yield
+    _compare(before, places, "the session")
+
+
+@pytest.fixture(autouse=True)
+def _clean_test(_clean_session: None, places: tuple[Path, Path], request: pytest.FixtureRequest) -> Iterator[None]:
+    os.chdir(places[1])
+    before = _traces(places)
+    yield
+    os.chdir(places[1])
+    _compare(before, places, request.node.name)
+
+
+def _compare(before: Traces, places: tuple[Path, Path], what: str) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while left := _traces(places).beyond(before):
+        gc.collect()  # a socket in a reference cycle is closed by its collection, not left behind
+        if time.monotonic() > deadline:
+            pytest.fail(f"{what} left behind: " + "; ".join(left), pytrace=False)
+        time.sleep(0.02)
+
+
+def _traces(places: tuple[Path, Path]) -> Traces:
+    return Traces(
+        processes=frozenset(_processes()),
+        threads=frozenset(f"{thread.name} ({thread.ident})" for thread in threading.enumerate()),
+        sockets=frozenset(_sockets()),
+        files=frozenset(str(path) for place in places for path in place.iterdir()),
+    )
+
+
+def _processes() -> Iterator[str]:
+    """Living processes that are children of this one or bear the session's mark."""
+    me = str(os.getpid())
+    for folder in Path("/proc").iterdir():
+        if not folder.name.isdigit() or folder.name == me:
+            continue
+        try:
+            # The name in brackets may hold blanks; state and parent follow the last bracket.
+            state, parent = (folder / "stat").read_text().rpartition(")")[2].split()[:2]
+            marked = MARK.encode() in (folder / "environ").read_bytes().split(b"\0")
+            command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+        except (OSError, ValueError):
+            continue  # it ended while we looked, or belongs to somebody else
+        if state != "Z" and (marked or parent == me) and not any(name in command for name in LONG_LIVED):
+            yield f"{folder.name} ({command[:120]})"
+
+
+def _sockets() -> Iterator[str]:
+    """Open sockets of this process, by the kernel's name for them."""
+    for descriptor in Path("/proc/self/fd").iterdir():
+        try:
+            if stat.S_ISSOCK(descriptor.stat().st_mode):
+                yield str(descriptor.readlink())
+        except OSError:
+            continue  # the descriptor of the listing itself
