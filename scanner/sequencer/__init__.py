@@ -1,0 +1,29 @@
+"""The sequencer: which image when (plan), the run itself, and the proof which frame saw which pattern.
+
+`plan`, `verify` and `witness` are pure; only `acquire`, `measure_latency` and `auto_exposure` touch devices.
+"""
+
+from scanner.sequencer.audit import CaptureCheck, check_capture
+from scanner.sequencer.plan import Mode, Plan, Rig, light_unit_ns, plan
+from scanner.sequencer.run import Acquisition, FinishReason, FrameSink, acquire
+from scanner.sequencer.verify import FrameVerdict, verify
+from scanner.sequencer.witness import Witness, Witnesses, witness
+
+__all__ = [
+    "Acquisition",
+    "CaptureCheck",
+    "FinishReason",
+    "FrameSink",
+    "FrameVerdict",
+    "Mode",
+    "Plan",
+    "Rig",
+    "Witness",
+    "Witnesses",
+    "acquire",
+    "check_capture",
+    "light_unit_ns",
+    "plan",
+    "verify",
+    "witness",
+]

@@ -1,0 +1,103 @@
+"""Verifies a capture again, from its folder alone: `fringed audit`, and the check before every decode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from scanner.capture import Capture
+from scanner.devices import Pixels
+from scanner.errors import DecodeError
+from scanner.sequencer.plan import Plan
+from scanner.sequencer.run import sync_error
+from scanner.sequencer.thumbnail import thumbnail
+from scanner.sequencer.verify import FrameVerdict, summary, verify
+from scanner.sequencer.witness import Witnesses, witness
+
+
+@dataclass(frozen=True)
+class CaptureCheck:
+    """What stamps and content of a capture say."""
+
+    capture: Capture
+    plan: Plan | None
+    """None for captures made elsewhere"""
+    verdicts: tuple[FrameVerdict, ...]
+    witnesses: Witnesses
+
+    @property
+    def suspects(self) -> tuple[int, ...]:
+        """Positions, in the pattern's frame list, of frames that stamps or content speak against."""
+        count = len(self.capture.header.sequence)
+        missing = set(self.capture.missing)
+        stamped = {v.pattern % count for v in self.verdicts if v.suspect and v.pattern not in missing}
+        return tuple(sorted(stamped | set(self.witnesses.suspects)))
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing speaks against the frames that are here."""
+        return not self.suspects and self.witnesses.passed
+
+    def summary(self) -> Mapping[str, int]:
+        """Number of frames by verdict."""
+        return summary(self.verdicts)
+
+    def raise_if_out_of_step(self) -> CaptureCheck:
+        """Raise SyncError naming the frames if anything speaks against them; else return self."""
+        if not self.passed:
+            raise sync_error(self.capture.header.sequence, self.verdicts, self.witnesses, self.suspects)
+        return self
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for report.json."""
+        return {
+            "passed": self.passed,
+            "verdicts": dict(self.summary()),
+            "frames": [
+                {"pattern": v.pattern, "verdict": v.verdict, "suspect": v.suspect, "reasons": list(v.reasons)}
+                for v in self.verdicts
+            ],
+            "witnesses": self.witnesses.as_list(),
+            "cannot_reveal": list(self.witnesses.cannot_reveal),
+            "suspects": list(self.suspects),
+        }
+
+
+def check_capture(capture: Capture) -> CaptureCheck:
+    """Verify the stamps and question the content of a capture's frames.
+
+    Frames that are missing are not an error here: whether the rest can be decoded is the method's to say.
+
+    Raises:
+        DecodeError: a frame cannot be read.
+    """
+    header = capture.header
+    plan = _plan(header.plan)
+    verdicts = verify(plan, header.sequence, capture.all_records) if plan is not None else _unstamped(capture)
+    count = len(header.sequence)
+    witnesses = Witnesses()
+    if count > 1:
+        for repetition in range(header.repeat):
+            shown: dict[int, Pixels] = {
+                position: thumbnail(capture.frame(repetition * count + position))
+                for position in range(count)
+                if repetition * count + position in capture.records
+            }
+            witnesses = witnesses.joined(witness(header.sequence, shown, header.camera.max_value))
+    return CaptureCheck(capture, plan, tuple(verdicts), witnesses)
+
+
+def _plan(content: Mapping[str, Any] | None) -> Plan | None:
+    if not content:
+        return None
+    try:
+        return Plan.from_dict(content)
+    except (KeyError, TypeError, ValueError) as error:
+        raise DecodeError(f"capture.json: its plan cannot be read: {error}") from error
+
+
+def _unstamped(capture: Capture) -> list[FrameVerdict]:
+    return [
+        FrameVerdict(pattern, "unproved", ("made elsewhere: no time stamps to judge",)) for pattern in capture.records
+    ]

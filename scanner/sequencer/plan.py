@@ -1,0 +1,402 @@
+"""The plan of a run: which image when, how long, and why. Pure: it sees capabilities and numbers, no device.
+
+A plan is made before anything moves, refuses in words what cannot work, and is stored with the capture, so that
+`verify` can judge the frames by it at any later time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Literal
+
+from scanner.devices import (
+    Camera,
+    CameraCapabilities,
+    CameraSettings,
+    Interval,
+    Projector,
+    ProjectorCapabilities,
+    ProjectorKind,
+    Source,
+    TriggerBoard,
+    TriggerMode,
+)
+from scanner.errors import ConfigError
+from scanner.patterns import PatternSequence
+
+DEFAULT_RETAKES = 2
+DEFAULT_MAX_SET_MS = 5000
+"""The object is taken to stand still, and the lamp to hold its level, for this long unless the caller knows better."""
+
+ASSUMED_REFRESHES = 2
+"""Refreshes waited after a flip where latency or settling was never measured: most displays lag by one."""
+
+
+class Mode(StrEnum):
+    """How frames and patterns are brought together."""
+
+    STATIC = "static"
+    """one pattern stays on, frames as they come"""
+    SOFTWARE = "software"
+    """flip, wait for the light, trigger the camera"""
+    FREE = "free"
+    """the camera runs by itself; the frame that fits into a pattern's time is taken, the others are dropped"""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The opened devices and what was measured of them.
+
+    `latency` and `settle` are the rig's own measured values and override the projector's; `trigger_mode` None means
+    software trigger where the camera has one, else free run. `mirror` and `rotate` say how the projector hangs: they
+    are applied to each image before it is loaded (mirror first), so that patterns land as described.
+    """
+
+    projector: Projector
+    camera: Camera
+    trigger: TriggerBoard | None = None
+    latency: Interval | None = None
+    settle: Interval | None = None
+    dwell: int | None = None
+    settings: CameraSettings = field(default_factory=CameraSettings)
+    trigger_mode: TriggerMode | None = None
+    mirror: bool = False
+    rotate: Literal[0, 180] = 0
+
+    def plan(self, sequence: PatternSequence, **options: Any) -> Plan:
+        """`plan` with this rig's devices and measured values; options are those of `plan` and go before the rig's."""
+        own: dict[str, Any] = {
+            "latency": self.latency,
+            "settle": self.settle,
+            "dwell": self.dwell,
+            "exposure_ns": self.settings.exposure_ns,
+            "trigger_mode": self.trigger_mode,
+        }
+        return plan(self.projector.capabilities, self.camera.capabilities, sequence, **{**own, **options})
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the runner does and what `verify` holds it to. Times in ns.
+
+    `why` gives, for each value that was decided here, the reason in words.
+    """
+
+    mode: Mode
+    patterns: int
+    """images of the sequence"""
+    repeat: int
+    """how often the sequence (static: the frame) is taken"""
+    exposure_ns: int
+    rolling_ns: int
+    """start of the first row to start of the last: part of every frame's exposure interval; 0 for a global shutter"""
+    dwell: int
+    """refreshes a pattern stays on, at least what its frame needs"""
+    period_ns: int
+    """time of one slot (static: of one frame)"""
+    camera_period_ns: int
+    trigger_delay_ns: int
+    """from the flip's stamp to the moment when the new image certainly shines"""
+    refresh_ns: int
+    modulation_ns: int | None
+    latency: Interval | None
+    settle: Interval | None
+    step_ns: int
+    """the camera's exposure step: how exactly a requested exposure can be met"""
+    stamp: Source
+    total_ns: int
+    pop_timeout_ns: int
+    max_set_ms: int
+    retakes: int
+    why: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def frame_count(self) -> int:
+        """Frames of a whole run."""
+        return self.patterns * self.repeat
+
+    @property
+    def window_start_ns(self) -> int:
+        """From a flip's stamp to when its image is wholly there, measured or assumed."""
+        return self.trigger_delay_ns
+
+    @property
+    def window_end_ns(self) -> int:
+        """From the next flip's stamp to when its image begins to show: the least latency, 0 where unmeasured."""
+        return self.latency.low_ns if self.latency is not None else 0
+
+    @property
+    def measured(self) -> bool:
+        """Whether latency and settling are known with bounds: without them nothing is proved."""
+        return self.mode is Mode.STATIC or (self.latency is not None and self.settle is not None)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for capture.json."""
+        return {
+            "mode": self.mode.value,
+            "patterns": self.patterns,
+            "repeat": self.repeat,
+            "exposure_ns": self.exposure_ns,
+            "rolling_ns": self.rolling_ns,
+            "dwell": self.dwell,
+            "period_ns": self.period_ns,
+            "camera_period_ns": self.camera_period_ns,
+            "trigger_delay_ns": self.trigger_delay_ns,
+            "refresh_ns": self.refresh_ns,
+            "modulation_ns": self.modulation_ns,
+            "latency_ns": _pair(self.latency),
+            "settle_ns": _pair(self.settle),
+            "step_ns": self.step_ns,
+            "stamp": self.stamp.value,
+            "total_ns": self.total_ns,
+            "pop_timeout_ns": self.pop_timeout_ns,
+            "max_set_ms": self.max_set_ms,
+            "retakes": self.retakes,
+            "why": dict(self.why),
+        }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Plan:
+        """Read what `as_dict` wrote.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is not a plan.
+        """
+        known = {key: content[key] for key in cls.__dataclass_fields__ if key in content}
+        return cls(
+            **{
+                **known,
+                "mode": Mode(content["mode"]),
+                "stamp": Source(content["stamp"]),
+                "latency": _interval(content["latency_ns"]),
+                "settle": _interval(content["settle_ns"]),
+                "why": dict(content.get("why", {})),
+            }
+        )
+
+
+def plan(
+    projector: ProjectorCapabilities,
+    camera: CameraCapabilities,
+    sequence: PatternSequence,
+    *,
+    exposure_ns: int | None = None,
+    repeat: int = 1,
+    trigger_mode: TriggerMode | None = None,
+    latency: Interval | None = None,
+    settle: Interval | None = None,
+    dwell: int | None = None,
+    retakes: int = DEFAULT_RETAKES,
+    max_set_ms: int = DEFAULT_MAX_SET_MS,
+) -> Plan:
+    """Plan a run of `sequence`, `repeat` times over.
+
+    A sequence of one image is `static`: it stays on and `repeat` frames are taken as they come.
+
+    Args:
+        exposure_ns: wanted exposure; None = one modulation period (or refresh).
+        trigger_mode: None = software where the camera has it, else free run.
+        latency, settle: measured on this rig; None = what the projector declares.
+        dwell: refreshes a pattern stays on at least; None = as few as its frame needs.
+        retakes: rounds of retakes before the run is given up.
+        max_set_ms: a retake later than this after its set repeats the set.
+
+    Raises:
+        ConfigError: it cannot work; the message says why and the hint what would.
+    """
+    if repeat < 1:
+        raise ConfigError(f"repeat must be 1 or more, got {repeat}")
+    why: dict[str, str] = {}
+    mode = _mode(projector, camera, sequence, trigger_mode, why)
+    _check_size(projector, sequence)
+    latency = latency or projector.latency
+    settle = settle or projector.settle
+    exposure = _exposure(projector, camera, mode, exposure_ns, why)
+    delay = _delay(projector, latency, settle, why)
+    rolling = camera.readout_ns if camera.shutter == "rolling" else 0
+    camera_period = camera.min_period_ns(exposure)
+    starts_after = camera.trigger_latency.high_ns if camera.trigger_latency is not None else 0
+    needed = _slot_time(mode, camera, exposure, delay, latency, starts_after)
+    least = max(1, -(-needed // projector.refresh_ns))
+    held = _dwell(mode, least, dwell, needed, projector, why)
+    period = camera_period if mode is Mode.STATIC else held * projector.refresh_ns
+    total = delay + period * len(sequence) * repeat
+    why["total_ns"] = f"{len(sequence) * repeat} frames of {_ms(period)} each, without retakes"
+    # A frame is missing only when it is surely not coming: exposure and transfer, a lost camera slot, and half a second
+    # for the host, which is not a real-time system.
+    timeout = starts_after + 2 * camera_period + exposure + camera.readout_ns + 500_000_000
+    return Plan(
+        mode=mode,
+        patterns=len(sequence),
+        repeat=repeat,
+        exposure_ns=exposure,
+        rolling_ns=rolling,
+        dwell=held,
+        period_ns=period,
+        camera_period_ns=camera_period,
+        trigger_delay_ns=delay,
+        refresh_ns=projector.refresh_ns,
+        modulation_ns=projector.modulation_period_ns,
+        latency=latency,
+        settle=settle,
+        step_ns=camera.exposure_step_ns,
+        stamp=camera.stamp,
+        total_ns=total,
+        pop_timeout_ns=timeout,
+        max_set_ms=max_set_ms,
+        retakes=retakes,
+        why=why,
+    )
+
+
+def light_unit_ns(projector: ProjectorCapabilities) -> int:
+    """The time that exposures are whole multiples of: the modulation period, or the refresh where there is none."""
+    return projector.modulation_period_ns or projector.refresh_ns
+
+
+def _mode(
+    projector: ProjectorCapabilities,
+    camera: CameraCapabilities,
+    sequence: PatternSequence,
+    asked: TriggerMode | None,
+    why: dict[str, str],
+) -> Mode:
+    if asked is TriggerMode.HARDWARE:
+        raise ConfigError(
+            "hardware trigger is not wired into the sequencer yet",
+            hint="leave trigger_mode out, or set it to software or free",
+        )
+    if asked is not None and asked not in camera.trigger_modes:
+        raise ConfigError(
+            f"the camera has no trigger mode {asked.value!r}",
+            hint=f"it has: {', '.join(sorted(mode.value for mode in camera.trigger_modes)) or 'none'}",
+        )
+    if projector.kind is ProjectorKind.SEQUENCER:
+        raise ConfigError(
+            "a projector that runs its own table needs hardware trigger, which is not wired into the sequencer yet",
+            hint="use it as a plain display (framebuffer) if it has such a mode",
+        )
+    if len(sequence) == 1:
+        if TriggerMode.FREE in camera.trigger_modes and asked is not TriggerMode.SOFTWARE:
+            why["mode"] = "one pattern: it stays on, and the camera runs by itself"
+            return Mode.STATIC
+    elif projector.kind is ProjectorKind.STATIC:
+        raise ConfigError(
+            f"a static projector shows one image, the sequence has {len(sequence)}",
+            hint="use a one-frame method (mcp) or a projector that can change its image",
+        )
+    if TriggerMode.SOFTWARE in camera.trigger_modes and asked is not TriggerMode.FREE:
+        why["mode"] = "the camera takes software triggers: each frame starts when its pattern shines"
+        return Mode.SOFTWARE
+    if TriggerMode.FREE in camera.trigger_modes:
+        why["mode"] = "asked for" if asked else "the camera has no software trigger: frames that fit are picked"
+        return Mode.FREE
+    raise ConfigError(
+        "the camera can neither run free nor be triggered by software",
+        hint="hardware trigger is not wired into the sequencer yet",
+    )
+
+
+def _check_size(projector: ProjectorCapabilities, sequence: PatternSequence) -> None:
+    size = sequence.projector
+    if (projector.width, projector.height) != (size.width, size.height):
+        raise ConfigError(
+            f"the patterns are {size.width} x {size.height}, the projector is {projector.width} x {projector.height}",
+            hint="make the patterns in the projector's native size: scaling shifts the code",
+        )
+
+
+def _exposure(
+    projector: ProjectorCapabilities,
+    camera: CameraCapabilities,
+    mode: Mode,
+    asked: int | None,
+    why: dict[str, str],
+) -> int:
+    unit = light_unit_ns(projector)
+    name = "modulation period" if projector.modulation_period_ns else "refresh"
+    wanted = unit if asked is None else asked
+    if wanted <= 0:
+        raise ConfigError(f"the exposure must be positive, got {wanted} ns")
+    constant = projector.modulation_period_ns is None
+    if constant and (wanted < unit or mode is Mode.STATIC):
+        exposure, reason = wanted, "as asked: this projector's light is constant, so a part of a refresh sees the same"
+    else:
+        count = max(1, round(wanted / unit))
+        exposure = count * unit
+        reason = f"{count} {name}{'s' if count > 1 else ''} of {_ms(unit)}"
+        if asked is not None and abs(exposure - asked) > camera.exposure_step_ns:
+            reason += f", rounded from {_ms(asked)}: a grey is whole only over a whole {name}"
+    step = max(1, camera.exposure_step_ns)
+    exposure = round(exposure / step) * step
+    if not camera.exposure_min_ns <= exposure <= camera.exposure_max_ns:
+        raise ConfigError(
+            f"an exposure of {_ms(exposure)} ({reason}) is outside the camera's "
+            f"{_ms(camera.exposure_min_ns)} .. {_ms(camera.exposure_max_ns)}",
+            hint=f"exposures are whole multiples of the projector's {name}, {_ms(unit)}",
+        )
+    why["exposure_ns"] = reason
+    return exposure
+
+
+def _delay(
+    projector: ProjectorCapabilities, latency: Interval | None, settle: Interval | None, why: dict[str, str]
+) -> int:
+    if latency is not None and settle is not None:
+        why["trigger_delay_ns"] = (
+            f"measured latency up to {_ms(latency.high_ns)} and settling up to {_ms(settle.high_ns)} after the flip"
+        )
+        return latency.high_ns + settle.high_ns
+    unknown = " and ".join(n for n, v in (("latency", latency), ("settling", settle)) if v is None)
+    why["trigger_delay_ns"] = (
+        f"{unknown} not measured: {ASSUMED_REFRESHES} refreshes assumed, and no frame can be proved"
+    )
+    known = (latency.high_ns if latency else 0) + (settle.high_ns if settle else 0)
+    return known + ASSUMED_REFRESHES * projector.refresh_ns
+
+
+def _slot_time(
+    mode: Mode, camera: CameraCapabilities, exposure: int, delay: int, latency: Interval | None, starts_after: int
+) -> int:
+    bounds = 2 * camera.stamp_bound_ns
+    if mode is Mode.FREE:
+        # The next image may already begin to show `latency.low` after its flip: only the spread is lost.
+        spread = delay - (latency.low_ns if latency is not None else 0)
+        return camera.readout_ns + exposure + camera.min_period_ns(exposure) + bounds + spread
+    return delay + starts_after + exposure + camera.readout_ns + bounds
+
+
+def _dwell(
+    mode: Mode, least: int, asked: int | None, needed: int, projector: ProjectorCapabilities, why: dict[str, str]
+) -> int:
+    if mode is Mode.STATIC:
+        why["dwell"] = "the pattern stays on"
+        return 1
+    what = (
+        "readout, exposure, one camera period and bounds"
+        if mode is Mode.FREE
+        else "light's delay, exposure, readout and bounds"
+    )
+    if asked is not None and asked < least:
+        raise ConfigError(
+            f"a dwell of {asked} refreshes of {_ms(projector.refresh_ns)} is too short: {what} take {_ms(needed)}",
+            hint=f"set dwell to {least} or more, or shorten the exposure",
+        )
+    why["dwell"] = f"{what} take {_ms(needed)} of {_ms(projector.refresh_ns)} refreshes" + (
+        "; longer by the rig file" if asked is not None and asked > least else ""
+    )
+    return asked or least
+
+
+def _ms(ns: float) -> str:
+    return f"{ns / 1e6:.3g} ms"
+
+
+def _pair(interval: Interval | None) -> list[int] | None:
+    return None if interval is None else [interval.low_ns, interval.high_ns]
+
+
+def _interval(pair: Any) -> Interval | None:
+    return None if pair is None else Interval(int(pair[0]), int(pair[1]))
