@@ -6,19 +6,21 @@ import logging
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
-from scanner.clock import Clock
-from scanner.devices import (
-    Camera,
-    CameraDriver,
-    DeviceInfo,
-    Projector,
-    ProjectorDriver,
-    TriggerBoard,
-    TriggerDriver,
-)
 from scanner.errors import ConfigError
+
+if TYPE_CHECKING:  # names of drivers are asked for by processes that load none, and no array library either
+    from scanner.clock import Clock
+    from scanner.devices import (
+        Camera,
+        CameraDriver,
+        DeviceInfo,
+        Projector,
+        ProjectorDriver,
+        TriggerBoard,
+        TriggerDriver,
+    )
 
 Kind = Literal["camera", "projector", "trigger"]
 
@@ -38,17 +40,17 @@ def open_camera(driver: str, device: str, options: Mapping[str, Any], clock: Clo
         ConfigError: no such driver; the hint lists those installed.
         DeviceError: see `scanner.devices.CameraDriver.open`.
     """
-    return cast(CameraDriver, _load("camera", driver)).open(device, options, clock)
+    return cast("CameraDriver", _load("camera", driver)).open(device, options, clock)
 
 
 def open_projector(driver: str, device: str, options: Mapping[str, Any], clock: Clock) -> Projector:
     """Open a projector by its driver's name; see `open_camera`."""
-    return cast(ProjectorDriver, _load("projector", driver)).open(device, options, clock)
+    return cast("ProjectorDriver", _load("projector", driver)).open(device, options, clock)
 
 
 def open_trigger(driver: str, device: str, options: Mapping[str, Any], clock: Clock) -> TriggerBoard:
     """Open a trigger board by its driver's name; see `open_camera`."""
-    return cast(TriggerDriver, _load("trigger", driver)).open(device, options, clock)
+    return cast("TriggerDriver", _load("trigger", driver)).open(device, options, clock)
 
 
 def driver_names(kind: Kind) -> list[str]:
