@@ -8,16 +8,17 @@ Distortion is Brown's (1966) with OpenCV's order k1, k2, p1, p2, k3. Triangulati
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from scanner.errors import CalibrationError
+from scanner.kernel import kernel
 
 Array = NDArray[np.float64]
 
@@ -40,12 +41,16 @@ class Lens:
             points: (..., 2) x, y in px.
 
         Returns:
-            (..., 2) float64: x / z, y / z of the ray, distortion removed by iteration to 1e-9.
+            (..., 2) float64: x / z, y / z of the ray, distortion removed by Newton's method to 1e-12; NaN where the
+            distortion has no inverse (beyond the fold of a strong negative k).
         """
-        flat = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 1, 2)
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
-        rays = cv2.undistortPoints(flat, self.matrix, self.distortion, None, None, None, criteria)
-        return np.asarray(rays, dtype=np.float64).reshape(np.shape(points))
+        flat = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+        m = self.matrix
+        y = (flat[:, 1] - m[1, 2]) / m[1, 1]
+        x = (flat[:, 0] - m[0, 2] - m[0, 1] * y) / m[0, 0]
+        if self.distortion.any():
+            _undistort(x, y, tuple(float(k) for k in self.distortion))
+        return np.stack((x, y), axis=-1).reshape(np.shape(points))
 
     def project(self, points: NDArray[Any]) -> Array:
         """Points in this lens's own frame to its pixels.
@@ -164,6 +169,64 @@ def calibration_from_dict(content: Any, name: str = "calibration") -> Calibratio
     known = {"format", "version", "id", "camera", "projector", "rotation", "translation"}
     extra = {key: value for key, value in content.items() if key not in known}
     return Calibration(**lenses, rotation=rotation, translation=translation, id=str(content.get("id", "")), extra=extra)
+
+
+def warm_up() -> None:
+    """Compile the kernels."""
+    _undistort(np.zeros(2), np.zeros(2), (1e-3, 0.0, 0.0, 0.0, 0.0))
+
+
+@kernel
+def _distortion_step(x: float, y: float, xt: float, yt: float, k: tuple[float, ...]) -> tuple[float, float, float]:
+    """Newton's step in x and y towards the point that distortion moves to (xt, yt), and the Jacobian's determinant."""
+    k1, k2, p1, p2, k3 = k
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+    ex = xt - (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x))
+    ey = yt - (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y)
+    xx = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+    yy = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+    xy = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
+    determinant = xx * yy - xy * xy
+    return (yy * ex - xy * ey) / determinant, (xx * ey - xy * ex) / determinant, determinant
+
+
+@kernel
+def _undistort(x: Array, y: Array, k: tuple[float, ...]) -> None:
+    """Remove distortion k1, k2, p1, p2, k3 from normalised coordinates x, y (N,), in place.
+
+    Three steps for all points without a branch, so that they become vector instructions; then the few that need more.
+    """
+    block = 512
+    xs, ys, last = np.empty(block), np.empty(block), np.empty(block)
+    for first in range(0, x.size, block):
+        n = min(block, x.size - first)
+        xt, yt = x[first : first + n], y[first : first + n]
+        for i in range(n):
+            u, v = xt[i], yt[i]
+            for _ in range(3):
+                du, dv, determinant = _distortion_step(u, v, xt[i], yt[i], k)
+                u, v = u + du, v + dv
+            xs[i], ys[i] = u, v
+            last[i] = du * du + dv * dv if determinant > 0.0 else np.inf
+        for i in range(n):
+            if last[i] < 1e-14:  # quadratic convergence: what is left is the last step's square, at most 1e-14
+                xt[i], yt[i] = xs[i], ys[i]
+            else:
+                xt[i], yt[i] = _distortion_undone(xt[i], yt[i], k)
+
+
+@kernel
+def _distortion_undone(xt: float, yt: float, k: tuple[float, ...]) -> tuple[float, float]:
+    """As many of Newton's steps as it takes, 50 at most; NaN if they do not end, or end beyond the fold."""
+    x, y = xt, yt
+    for _ in range(50):
+        dx, dy, determinant = _distortion_step(x, y, xt, yt, k)
+        x, y = x + dx, y + dy
+        if math.hypot(dx, dy) < 1e-12 and determinant > 0.0:
+            return x, y
+    return np.nan, np.nan
 
 
 def _lens_dict(lens: Lens) -> dict[str, Any]:

@@ -1,0 +1,255 @@
+"""What is taken out of a cloud: points that fly at depth edges, specks, and what lies outside the user's limits.
+
+A filter takes points (xyz), never measurements: rows and columns stay as decoded. Each counts what it removed.
+The edge filter asks one question of each pair of neighbouring pixels: is the step between their points steeper than a
+surface that can be measured? Two neighbours on one surface differ along the line of sight by at most the pixel's
+footprint x tan(80 degrees), plus their noise. Where they differ by more there is a depth edge, and both pixels may
+have seen both sides of it: both fall. What is left of a flying sheet are specks, which fall by their size.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.errors import ConfigError
+from scanner.kernel import kernel
+
+Map = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+DEFAULT_MAX_ANGLE_DEG = 80.0
+"""Between a surface's normal and the line of sight. At 80 degrees the footprint of a pixel is 5.8 times as long as
+wide, and light returned by a matt surface is a sixth: beyond it fringes blur into each other."""
+
+DEFAULT_MIN_FRAGMENT = 30
+"""Pixels. Optics spread a point over about pi (3 sigma)^2 = 28 pixels at sigma 1 px: what is smaller than that holds
+no two independent measurements."""
+
+NOISE_SIGMAS = 4.0
+"""Of the difference of two neighbours: 6 in 100,000 steps on a smooth surface exceed it by chance."""
+
+SPARSE_SHARE = 0.5
+"""If more than this share of all points lies in fragments below the limit, the map is sparse by its method, and its
+points are no specks: the fragment filter then leaves it alone."""
+
+BOX_KEYS = ("xmin:xmax", "ymin:ymax", "zmin:zmax")
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """Which points to take out. The default takes flying points and specks."""
+
+    edges: bool = True
+    """points at depth edges, and fragments"""
+    max_angle_deg: float = DEFAULT_MAX_ANGLE_DEG
+    """steepest surface that is kept, between its normal and the line of sight"""
+    min_fragment: int = DEFAULT_MIN_FRAGMENT
+    """fragments of fewer pixels than this fall"""
+    depth: tuple[float, float] | None = None
+    """nearest and farthest z, mm, camera frame"""
+    box: tuple[float, float, float, float, float, float] | None = None
+    """xmin, xmax, ymin, ymax, zmin, zmax, mm, camera frame"""
+    min_confidence: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.max_angle_deg < 90:
+            raise ConfigError(f"filter max_angle_deg must lie between 0 and 90 degrees, got {self.max_angle_deg:g}")
+        if self.min_fragment < 0:
+            raise ConfigError(f"filter min_fragment must be 0 or more pixels, got {self.min_fragment}")
+        if not 0 <= self.min_confidence <= 1:
+            raise ConfigError(f"filter min_confidence must lie in 0 .. 1, got {self.min_confidence:g}")
+        if self.depth is not None:
+            _check_limits(self.depth, "depth", ("near:far",))
+        if self.box is not None:
+            _check_limits(self.box, "box", BOX_KEYS)
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> FilterSettings:
+        """The settings that `dataclasses.asdict` described; absent members have their defaults.
+
+        Raises:
+            ConfigError: an unknown member, or a value that makes no sense.
+        """
+        known = {field.name for field in fields(cls)}
+        if unknown := set(content) - known:
+            raise ConfigError(f"unknown filter {sorted(unknown)[0]!r}", hint=f"filters: {', '.join(sorted(known))}")
+        members = {key: value for key, value in content.items() if value is not None}
+        try:
+            for key in ("depth", "box"):
+                if key in members:
+                    members[key] = tuple(float(limit) for limit in members[key])
+            return cls(**members)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"filters: {error}") from error
+
+
+def parse_depth(text: str) -> tuple[float, float]:
+    """`NEAR:FAR` in mm, either side may be empty (no limit).
+
+    Raises:
+        ConfigError: not of that form, or near is not below far.
+    """
+    return _parse(text, "depth", ("near:far",))[0]
+
+
+def parse_box(text: str) -> tuple[float, float, float, float, float, float]:
+    """`XMIN:XMAX,YMIN:YMAX,ZMIN:ZMAX` in mm, each side may be empty (no limit).
+
+    Raises:
+        ConfigError: not of that form, or a minimum is not below its maximum.
+    """
+    x, y, z = _parse(text, "box", BOX_KEYS)
+    return (*x, *y, *z)
+
+
+def apply_filters(xyz: Map, sigma_z: Map, confidence: Map, settings: FilterSettings) -> tuple[Mask, dict[str, int]]:
+    """Which points fall, and how many to which filter.
+
+    A point counts for the first filter that takes it: confidence, edges, depth, box, fragments. Fragments come last, so
+    that what a limit leaves of something else falls with it.
+
+    Args:
+        xyz: (H, W, 3) float32 mm, camera frame, NaN = no point.
+        sigma_z: (H, W) float32 mm; NaN counts as no noise.
+        confidence: (H, W) float32.
+        settings: which filters.
+
+    Returns:
+        (H, W) bool, True where a point there was falls; counts by filter, 0 for those that were not asked for.
+    """
+    z = xyz[..., 2]
+    there = ~np.isnan(z)
+    keep = there.copy()
+    removed: dict[str, int] = {}
+
+    def take(name: str, falls: Mask) -> None:
+        before = int(np.count_nonzero(keep))
+        np.logical_and(keep, ~falls, out=keep)
+        removed[name] = before - int(np.count_nonzero(keep))
+
+    nothing = np.broadcast_to(np.bool_(False), keep.shape)
+    take("confidence", confidence < settings.min_confidence if settings.min_confidence > 0 else nothing)
+    take("edges", at_depth_edge(xyz, sigma_z, keep, settings.max_angle_deg) if settings.edges else nothing)
+    take("depth", _outside(z, settings.depth) if settings.depth else nothing)
+    take("box", _outside_box(xyz, settings.box) if settings.box else nothing)
+    take("fragments", _in_fragment(keep, settings.min_fragment) if settings.edges else nothing)
+    return there & ~keep, removed
+
+
+def at_depth_edge(xyz: Map, sigma_z: Map, there: Mask, max_angle_deg: float = DEFAULT_MAX_ANGLE_DEG) -> Mask:
+    """(H, W) bool: pixels with a neighbour (left, right, above, below) on the other side of a depth edge.
+
+    The noise that is allowed for is the larger of sigma_z and what the points themselves show, so that a map noisier
+    than it says is not torn apart.
+    """
+    noise = NOISE_SIGMAS * math.sqrt(2.0) * noise_factor(xyz[..., 2], sigma_z)
+    edge = np.zeros(there.shape, np.bool_)
+    _mark_edges(xyz, sigma_z, there, math.tan(math.radians(max_angle_deg)), noise, edge)
+    return edge
+
+
+def noise_factor(z: Map, sigma_z: Map) -> float:
+    """How many times noisier the depths are than sigma_z says, at least 1.
+
+    From second differences along lines, z[j-1] - 2 z[j] + z[j+1], which see noise (sqrt 6 sigma) and hardly any shape;
+    their median is blind to edges.
+    """
+    lines, sigmas = z[::4], sigma_z[::4]
+    second = np.abs(lines[:, :-2] - 2 * lines[:, 1:-1] + lines[:, 2:]) / sigmas[:, 1:-1]
+    second = second[np.isfinite(second)]
+    if second.size < 100:
+        return 1.0
+    return max(1.0, float(np.median(second)) / (0.6745 * math.sqrt(6.0)))
+
+
+def warm_up() -> None:
+    """Compile the kernels."""
+    xyz, z = np.ones((2, 2, 3), np.float32), np.ones((2, 2), np.float32)
+    _mark_edges(xyz, z, np.ones((2, 2), np.bool_), 5.7, 1.0, np.zeros((2, 2), np.bool_))
+
+
+def _parse(text: str, name: str, keys: tuple[str, ...]) -> list[tuple[float, float]]:
+    form = ",".join(keys)
+    parts = [part.split(":") for part in text.split(",")]
+    if len(parts) != len(keys) or any(len(part) != 2 for part in parts):
+        raise ConfigError(f"{name} must be {form} in mm, got {text!r}", hint=f"for example {_EXAMPLES[name]}")
+    try:
+        limits = [
+            (float(low) if low.strip() else -math.inf, float(high) if high.strip() else math.inf) for low, high in parts
+        ]
+    except ValueError as error:
+        raise ConfigError(f"{name} must be numbers {form} in mm, got {text!r}") from error
+    _check_limits(tuple(limit for pair in limits for limit in pair), name, keys)
+    return limits
+
+
+_EXAMPLES = {"depth": "1100:1300", "box": "-100:100,-80:80,1100:1300"}
+
+
+def _check_limits(limits: tuple[float, ...], name: str, keys: tuple[str, ...]) -> None:
+    if len(limits) != 2 * len(keys):
+        raise ConfigError(f"filter {name} takes {2 * len(keys)} numbers ({','.join(keys)}), got {len(limits)}")
+    for key, low, high in zip(keys, limits[::2], limits[1::2], strict=True):
+        if not low < high:
+            raise ConfigError(f"filter {name}: {key} must be given smaller first, got {low:g}:{high:g}")
+
+
+def _outside(values: Map, limits: tuple[float, float]) -> Mask:
+    return ~((values >= limits[0]) & (values <= limits[1]))
+
+
+def _outside_box(xyz: Map, box: tuple[float, ...]) -> Mask:
+    outside = _outside(xyz[..., 0], (box[0], box[1]))
+    for axis in (1, 2):
+        outside |= _outside(xyz[..., axis], (box[2 * axis], box[2 * axis + 1]))
+    return outside
+
+
+def _in_fragment(there: Mask, min_pixels: int) -> Mask:
+    """(H, W) bool: pixels in connected regions (4 neighbours) smaller than `min_pixels`."""
+    if min_pixels <= 1:
+        return np.zeros_like(there)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(there.view(np.uint8), connectivity=4, ltype=cv2.CV_32S)
+    small = stats[:, cv2.CC_STAT_AREA] < min_pixels
+    small[0] = False
+    if stats[small, cv2.CC_STAT_AREA].sum() > SPARSE_SHARE * np.count_nonzero(there):
+        return np.zeros_like(there)
+    return np.asarray(small[labels], dtype=np.bool_)
+
+
+@kernel
+def _mark_edges(xyz: Map, sigma_z: Map, there: Mask, steepest: float, noise: float, edge: Mask) -> None:
+    """Mark both pixels of every pair of neighbours whose step along the line of sight no surface explains."""
+    height, width = there.shape
+    for i in range(height):
+        for j in range(width):
+            if not there[i, j]:
+                continue
+            if j + 1 < width and there[i, j + 1] and _jump(xyz, sigma_z, i, j, i, j + 1, steepest, noise):
+                edge[i, j] = edge[i, j + 1] = True
+            if i + 1 < height and there[i + 1, j] and _jump(xyz, sigma_z, i, j, i + 1, j, steepest, noise):
+                edge[i, j] = edge[i + 1, j] = True
+
+
+@kernel
+def _jump(xyz: Map, sigma_z: Map, i: int, j: int, k: int, m: int, steepest: float, noise: float) -> bool:
+    """Whether the step between two pixels' points is steeper than `steepest` (along / across sight) plus noise."""
+    x, y, z = xyz[i, j, 0], xyz[i, j, 1], xyz[i, j, 2]
+    dx, dy, dz = xyz[k, m, 0] - x, xyz[k, m, 1] - y, xyz[k, m, 2] - z
+    # The line of sight through the middle of the two points; what the step has along it and across it.
+    sx, sy, sz = x + 0.5 * dx, y + 0.5 * dy, z + 0.5 * dz
+    square = sx * sx + sy * sy + sz * sz
+    dot = dx * sx + dy * sy + dz * sz
+    across2 = max((dx * dx + dy * dy + dz * dz) * square - dot * dot, 0.0)
+    if dot * dot <= steepest * steepest * across2:
+        return False  # nearly all pairs end here, before the square roots
+    sigma = max(sigma_z[i, j], sigma_z[k, m])
+    allowed = noise * sigma if sigma > 0.0 else 0.0
+    return bool((abs(dot) - steepest * math.sqrt(across2)) > allowed * math.sqrt(square))

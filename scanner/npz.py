@@ -1,0 +1,82 @@
+"""Uncompressed .npz files: NumPy's own format, without copies on the way out or trust on the way in.
+
+`numpy.load(path, allow_pickle=False)` reads what is written here. Reading checks every member's dtype and its size
+against its header before a byte of it is decoded.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.errors import StorageError
+
+MAX_BYTES = 4 << 30
+"""Of one array: a scan of a 100-megapixel camera stays below it."""
+
+
+def write_npz(file: BinaryIO, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays as an uncompressed .npz; the same arrays give the same bytes."""
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in arrays.items():
+            solid = np.ascontiguousarray(array)
+            info = zipfile.ZipInfo(f"{name}.npy")  # dated 1980, whatever the clock says
+            info.external_attr = 0o644 << 16
+            info.file_size = solid.nbytes + 1024  # decides whether the member needs 64-bit sizes
+            with archive.open(info, "w") as member:
+                header = np.lib.format.header_data_from_array_1_0(solid)
+                np.lib.format.write_array_header_1_0(member, header)
+                member.write(bytes_of(solid))
+
+
+def read_npz(path: Path, dtypes: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """Read the members that `dtypes` names, as far as they are there; others are ignored.
+
+    Raises:
+        StorageError: unreadable, damaged, compressed, or a member of another dtype or of a size that is not its own.
+    """
+    arrays: dict[str, NDArray[Any]] = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for info in archive.infolist():
+                name = info.filename.removesuffix(".npy")
+                if name in dtypes:
+                    arrays[name] = _read(archive, info, np.dtype(dtypes[name]), f"{path}: {name}")
+    except FileNotFoundError as error:
+        raise StorageError(f"{path} is not there", hint="a scan's folder holds scan.npz") from error
+    except OSError as error:
+        raise StorageError(f"cannot read {path}: {error.strerror or error}") from error
+    except (zipfile.BadZipFile, EOFError, ValueError, RuntimeError, NotImplementedError) as error:
+        raise StorageError(f"{path} is damaged: {error}") from error
+    return arrays
+
+
+def bytes_of(array: NDArray[Any]) -> memoryview:
+    """The bytes of a C-contiguous array, not copied."""
+    if array.size == 0:
+        return memoryview(bytearray())
+    return array.reshape(-1).view(np.uint8).data
+
+
+def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo, dtype: np.dtype[Any], name: str) -> NDArray[Any]:
+    if info.compress_type != zipfile.ZIP_STORED or info.file_size > MAX_BYTES:
+        raise StorageError(f"{name} is compressed or larger than {MAX_BYTES >> 30} GiB", hint="write it uncompressed")
+    with archive.open(info) as member:
+        version = np.lib.format.read_magic(member)
+        if version != (1, 0):
+            raise StorageError(f"{name} has version {version} of the .npy format, this program reads (1, 0)")
+        shape, fortran, found = np.lib.format.read_array_header_1_0(member)
+        if found != dtype or fortran:
+            raise StorageError(f"{name} holds {found}{' in Fortran order' if fortran else ''}, expected {dtype}")
+        expected = int(np.prod(shape, dtype=object)) * dtype.itemsize
+        if info.file_size - member.tell() != expected:
+            raise StorageError(f"{name} has {info.file_size - member.tell()} bytes, its header says {expected}")
+        array = np.empty(shape, dtype)
+        # To the end: there the member's checksum is compared.
+        bytes_of(array)[:] = member.read()
+    return array

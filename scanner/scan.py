@@ -1,0 +1,352 @@
+"""A Scan: what decoding made of a capture, in maps on the camera's grid and points in millimetres, and its folder.
+
+`build_scan` makes one from decoded maps and a calibration; `Scan.save` and `load_scan` write and read the folder of
+formats.md (scan.npz, cloud.ply, preview.png, report.json). Pictures are drawn in `scanner.preview`.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode import Decoded, Reason
+from scanner.errors import StorageError
+from scanner.filters import FilterSettings, apply_filters
+from scanner.geometry import Calibration
+from scanner.normals import normals_of
+from scanner.npz import read_npz, write_npz
+from scanner.ply import vertices_of, write_ply
+from scanner.preview import preview_picture
+from scanner.storage import replace_file, replace_json, replacing, storage_errors
+from scanner.triangulation import triangulate
+
+Map = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Picture = NDArray[np.uint8]
+
+FORMAT = "fringed-report"
+VERSION = 1
+
+Progress = Callable[[str], None]
+"""Told the name of each file as it is written whole."""
+
+_MAPS = ("rows", "columns", "sigma_rows", "sigma_columns", "sigma_z", "confidence", "albedo", "modulation")
+_DTYPES = {**dict.fromkeys(_MAPS, "<f4"), "xyz": "<f4", "reason": "u1", "stripes": "<i2", "peaks": "<f4"}
+_NOT_LIT = (Reason.SHADOW, Reason.LOW_MODULATION)
+_DECODED = (Reason.VALUE, Reason.FILTERED)
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One scan; maps are (H, W) float32 on the raw camera grid, NaN where there is nothing (formats.md, Scan)."""
+
+    rows: Map | None
+    columns: Map | None
+    sigma_rows: Map | None
+    sigma_columns: Map | None
+    confidence: Map
+    albedo: Map
+    modulation: Map
+    reason: NDArray[np.uint8]
+    xyz: Map | None = None
+    """(H, W, 3) float32 mm, camera frame; None without a calibration"""
+    sigma_z: Map | None = None
+    stripes: NDArray[np.int16] | None = None
+    peaks: Map | None = None
+    report: Mapping[str, Any] = field(default_factory=dict)
+    """plain data, as report.json has it"""
+    error_map: Picture | None = None
+    """(h, w, 3) uint8 BGR: what comparison with truth drew, saved as error_map.png"""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+        height, width = self.reason.shape
+        return height, width
+
+    @cached_property
+    def valid(self) -> Mask:
+        """(H, W) bool: pixels with a point, or with a decoded value where there is no calibration."""
+        return self.decoded if self.xyz is None else ~np.isnan(self.xyz[..., 2])
+
+    @property
+    def decoded(self) -> Mask:
+        """(H, W) bool: pixels with a decoded value, whatever the filters did."""
+        return np.isin(self.reason, _DECODED)
+
+    @property
+    def lit(self) -> Mask:
+        """(H, W) bool: pixels that the projector's light reached, as far as the decoder could see."""
+        return np.isin(self.reason, _NOT_LIT, invert=True)
+
+    @property
+    def points(self) -> Map:
+        """(N, 3) float32 mm, camera frame, line by line; N = 0 without a calibration."""
+        return np.empty((0, 3), np.float32) if self.xyz is None else self.xyz[self.valid]
+
+    @property
+    def intensity(self) -> Map:
+        """(N,) float32: albedo of each point, camera grey levels."""
+        return self.albedo[self.valid]
+
+    @cached_property
+    def normals(self) -> Map | None:
+        """(H, W, 3) float32, unit, towards the camera; see `scanner.normals`. None without a calibration."""
+        return None if self.xyz is None else normals_of(self.xyz)
+
+    @property
+    def coverage(self) -> float:
+        """Share of lit pixels with a decoded value; 0 if nothing is lit."""
+        return _share(np.count_nonzero(self.decoded), np.count_nonzero(self.lit))
+
+    def with_report(self, **members: Any) -> Scan:
+        """The same scan with more in its report."""
+        return replace(self, report={**self.report, **members})
+
+    def save(self, folder: Path, progress: Progress | None = None) -> tuple[str, ...]:
+        """Write the folder: scan.npz, cloud.ply, preview.png, (error_map.png,) report.json, each whole, in this order.
+
+        report.json is last: a folder that has it is complete. Files of an earlier scan are removed first. A cloud
+        without points gets no cloud.ply, and a warning in the report.
+
+        Returns:
+            Names of the files written, in order.
+
+        Raises:
+            StorageError: the folder cannot be written.
+        """
+        written: list[str] = []
+        timings = dict(self.report.get("timings", {}))
+        warnings = list(self.report.get("warnings", ()))
+        with storage_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            for name in ("report.json", "error_map.png", "preview.png", "cloud.ply", "scan.npz"):
+                (folder / name).unlink(missing_ok=True)
+
+        @contextmanager
+        def file(name: str) -> Iterator[Path]:
+            with _timed(timings, f"write {name}"):
+                yield folder / name
+            written.append(name)
+            if progress is not None:
+                progress(name)
+
+        with file("scan.npz") as path, replacing(path) as npz:
+            write_npz(npz, self.arrays())
+        if self.xyz is not None and self.normals is not None and self.valid.any():
+            with file("cloud.ply") as path, replacing(path) as ply:
+                vertices = vertices_of(self.xyz, self.normals, self.albedo, self.confidence)
+                write_ply(ply, vertices, ("fringed; mm, camera frame: x right, y down, z forward",))
+        elif self.xyz is not None:
+            warnings.append("the cloud has no points: cloud.ply was not written")
+        with file("preview.png") as path:
+            replace_file(path, _png(preview_picture(self)))
+        if self.error_map is not None:
+            with file("error_map.png") as path:
+                replace_file(path, _png(self.error_map))
+        with file("report.json") as path:
+            replace_json(path, {**self.report, "timings": timings, "warnings": warnings})
+        return tuple(written)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The members of scan.npz, by name; those this scan has not are absent."""
+        values = {name: getattr(self, name) for name in _DTYPES}
+        return {name: np.asarray(value, dtype=_DTYPES[name]) for name, value in values.items() if value is not None}
+
+
+def build_scan(
+    decoded: Decoded,
+    calibration: Calibration | None = None,
+    filters: FilterSettings | None = None,
+    *,
+    timings: dict[str, float] | None = None,
+) -> Scan:
+    """Triangulate and filter decoded maps.
+
+    Args:
+        decoded: the maps.
+        calibration: the rig; None gives a scan without points.
+        filters: None = `FilterSettings()`.
+        timings: seconds by stage so far; this function's stages are added, and the report gets them all.
+
+    Raises:
+        CalibrationError: see `scanner.triangulation.triangulate`.
+    """
+    settings = filters or FilterSettings()
+    timings = {} if timings is None else timings
+    xyz = sigma_z = None
+    reason = decoded.reason
+    removed: dict[str, int] = {}
+    if calibration is not None:
+        with _timed(timings, "triangulate"):
+            found = triangulate(
+                calibration,
+                rows=decoded.rows,
+                columns=decoded.columns,
+                sigma_rows=decoded.sigma_rows,
+                sigma_columns=decoded.sigma_columns,
+            )
+        with _timed(timings, "filter"):
+            falls, removed = apply_filters(found.xyz, found.sigma_z, decoded.confidence, settings)
+            found.xyz[falls] = np.nan
+            found.sigma_z[falls] = np.nan
+            removed = {"impossible": found.impossible, **removed}
+            xyz, sigma_z = found.xyz, found.sigma_z
+            reason = decoded.reason.copy()
+            reason[(reason == Reason.VALUE) & np.isnan(xyz[..., 2])] = Reason.FILTERED
+    scan = Scan(
+        **{name: getattr(decoded, name) for name in _MAPS if name != "sigma_z"},
+        reason=reason,
+        xyz=xyz,
+        sigma_z=sigma_z,
+        stripes=decoded.stripes,
+        peaks=decoded.peaks,
+    )
+    with _timed(timings, "normals"):
+        _ = scan.normals
+    return _with_same_normals(scan, _report(scan, decoded, calibration, settings, removed, timings))
+
+
+def load_scan(folder: Path) -> Scan:
+    """Read a scan's folder: scan.npz, and report.json if it is there.
+
+    Raises:
+        StorageError: scan.npz is missing or damaged, or its arrays do not belong together.
+    """
+    path = folder / "scan.npz"
+    arrays = read_npz(path, _DTYPES)
+    missing = {"confidence", "albedo", "modulation", "reason"} - arrays.keys()
+    if missing or not arrays.keys() & {"rows", "columns"}:
+        raise StorageError(f"{path} lacks {', '.join(sorted(missing)) or 'rows and columns'}: it is no scan")
+    shape = arrays["reason"].shape
+    for name, array in arrays.items():
+        expected = {"xyz": (*shape, 3), "peaks": (*array.shape[:1], 5)}.get(name, shape)
+        if len(shape) != 2 or array.shape != expected:
+            raise StorageError(f"{path}: {name} has shape {array.shape}, expected {expected}")
+    for name in ("rows", "columns", "sigma_rows", "sigma_columns"):
+        arrays.setdefault(name, None)  # type: ignore[arg-type]
+    return Scan(**arrays, report=_read_report(folder / "report.json"))
+
+
+def _read_report(path: Path) -> dict[str, Any]:
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise StorageError(f"cannot read {path}: {error}") from error
+    if not isinstance(report, dict) or report.get("format") != FORMAT or report.get("version") != VERSION:
+        raise StorageError(f"{path} is no version {VERSION} of {FORMAT}", hint="update fringed, or remove the file")
+    return report
+
+
+def _report(
+    scan: Scan,
+    decoded: Decoded,
+    calibration: Calibration | None,
+    settings: FilterSettings,
+    removed: Mapping[str, int],
+    timings: Mapping[str, float],
+) -> dict[str, Any]:
+    pixels, lit, values = scan.reason.size, np.count_nonzero(scan.lit), np.count_nonzero(scan.decoded)
+    points = 0 if scan.xyz is None else np.count_nonzero(scan.valid)
+    report: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "points": int(points),
+        "counts": {"pixels": int(pixels), "lit": int(lit), "decoded": int(values), "reasons": _reasons(scan.reason)},
+        "coverage": {
+            "image": _share(values, pixels),
+            "lit": _share(values, lit),
+            "points_of_lit": _share(points, lit),
+        },
+        "removed": dict(removed),
+        "filters": asdict(settings),
+        "rows_px": _spread(scan.rows),
+        "columns_px": _spread(scan.columns),
+        "sigma_rows_px": _spread(scan.sigma_rows),
+        "sigma_columns_px": _spread(scan.sigma_columns),
+        "depth_mm": _spread(None if scan.xyz is None else scan.xyz[..., 2]),
+        "sigma_z_mm": _spread(scan.sigma_z),
+        "rig": None if calibration is None else _rig(calibration),
+        "decoder": dict(decoded.details),
+        "warnings": list(decoded.warnings),
+        "timings": dict(timings),
+        "versions": versions(),
+    }
+    return report
+
+
+def versions() -> dict[str, str]:
+    """What made the scan: fringed, Python and the libraries whose numbers could differ."""
+    try:
+        own = metadata.version("fringed")
+    except metadata.PackageNotFoundError:
+        own = "not installed"
+    return {
+        "fringed": own,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "opencv": cv2.__version__,
+        "numba": numba.__version__,
+    }
+
+
+def _with_same_normals(scan: Scan, report: Mapping[str, Any]) -> Scan:
+    """The scan with its report; normals that were computed are kept."""
+    made = replace(scan, report=report)
+    made.__dict__["normals"] = scan.normals
+    return made
+
+
+def _reasons(reason: NDArray[np.uint8]) -> dict[str, int]:
+    counts = np.bincount(reason.ravel(), minlength=len(Reason))
+    return {kind.name.lower(): int(counts[kind]) for kind in Reason}
+
+
+def _rig(calibration: Calibration) -> dict[str, Any]:
+    return {"calibration": calibration.id, "projector_centre_mm": calibration.projector_centre.tolist()}
+
+
+def _spread(values: Map | None) -> dict[str, float] | None:
+    """1st, 50th and 99th percentile of a map, from every fourth pixel each way where it is large."""
+    if values is None:
+        return None
+    sample = values[::4, ::4] if values.size > 100_000 else values
+    sample = sample[np.isfinite(sample)]
+    if sample.size == 0:
+        return None
+    low, median, high = np.percentile(sample, (1, 50, 99))
+    return {"p1": float(low), "median": float(median), "p99": float(high)}
+
+
+def _share(part: int | np.intp, whole: int | np.intp) -> float:
+    return float(part) / float(whole) if whole else 0.0
+
+
+def _png(picture: Picture) -> bytes:
+    # Level 1 costs a tenth of the default's time and a few per cent in size on such pictures.
+    _, content = cv2.imencode(".png", picture, (cv2.IMWRITE_PNG_COMPRESSION, 1))
+    return content.tobytes()
+
+
+@contextmanager
+def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+    begin = time.perf_counter()
+    try:
+        yield
+    finally:
+        timings[stage] = round(timings.get(stage, 0.0) + time.perf_counter() - begin, 6)
