@@ -1,0 +1,66 @@
+"""What the registry opens: the simulated camera's and projector's drivers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from drivers.simulated.camera import SimulatedCamera
+from drivers.simulated.options import DEFAULT_SCENE, read_settings
+from drivers.simulated.projector import SimulatedProjector
+from drivers.simulated.rigs import rig, rig_names
+from drivers.simulated.scenes import scene_names
+from drivers.simulated.world import enter_world
+from scanner.clock import Clock
+from scanner.devices import DeviceInfo
+
+DRIVER = "simulated"
+
+
+class SimulatedCameraDriver:
+    """Entry point of the group `fringed.cameras`; see `options` for device strings and option tables."""
+
+    def open(self, device: str, options: Mapping[str, Any], clock: Clock) -> SimulatedCamera:
+        """Open the camera of a simulated world.
+
+        Raises:
+            ConfigError: unknown rig, scene or option, or one that contradicts the projector's.
+            DeviceBusy: that world's camera is open already.
+        """
+        settings = read_settings(device, options, "camera")
+        name = _name(settings.world.rig, settings.world.scene, "camera")
+        return SimulatedCamera(enter_world(settings, clock, name), settings, name)
+
+    def discover(self) -> Sequence[DeviceInfo]:
+        """One camera for each reference rig."""
+        return [_info(name, "camera") for name in rig_names()]
+
+
+class SimulatedProjectorDriver:
+    """Entry point of the group `fringed.projectors`."""
+
+    def open(self, device: str, options: Mapping[str, Any], clock: Clock) -> SimulatedProjector:
+        """Open the projector of a simulated world; see `SimulatedCameraDriver.open`."""
+        settings = read_settings(device, options, "projector")
+        name = _name(settings.world.rig, settings.world.scene, "projector")
+        return SimulatedProjector(enter_world(settings, clock, name), settings, name)
+
+    def discover(self) -> Sequence[DeviceInfo]:
+        """One projector for each reference rig."""
+        return [_info(name, "projector") for name in rig_names()]
+
+
+def _name(rig_name: str, scene: str, role: str) -> str:
+    return f"simulated {role} {rig_name}/{scene}"
+
+
+def _info(rig_name: str, kind: Literal["camera", "projector"]) -> DeviceInfo:
+    calibration = rig(rig_name).calibration
+    lens = calibration.camera if kind == "camera" else calibration.projector
+    return DeviceInfo(
+        driver=DRIVER,
+        device=f"{rig_name}/{DEFAULT_SCENE}",
+        kind=kind,
+        model=f"simulated rig {rig_name}",
+        details={"width": lens.size[0], "height": lens.size[1], "scenes": list(scene_names())},
+    )
