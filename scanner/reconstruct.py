@@ -1,0 +1,209 @@
+"""From the frames of one capture to a Scan: check, decode, triangulate, filter, compare.
+
+One path for every caller: the decode worker feeds frames as they arrive, `fringed decode` feeds a folder at once.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scanner.capture import Capture, CaptureHeader
+from scanner.compare import compare
+from scanner.decode import Decoder, decoder_for
+from scanner.devices import Pixels, Truth
+from scanner.errors import CalibrationError, DecodeError
+from scanner.filters import FilterSettings
+from scanner.geometry import Calibration, load_calibration
+from scanner.scan import Scan, build_scan
+from scanner.sequencer import check_capture
+
+TRUTH_FILE = "truth.npz"
+
+Progress = Callable[[str], None]
+"""Told the name of each stage as it begins."""
+
+
+@dataclass(frozen=True)
+class DecodeOptions:
+    """What a user may choose about decoding."""
+
+    decoder: str = "default"
+    filters: FilterSettings = field(default_factory=FilterSettings)
+    compare_truth: bool = False
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data, for the wire and for reports."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> DecodeOptions:
+        """The options that `as_dict` described; absent members have their defaults.
+
+        Raises:
+            ConfigError: a member has a value that makes no sense.
+        """
+        return cls(
+            decoder=str(content.get("decoder", "default")),
+            filters=FilterSettings.from_dict(content.get("filters") or {}),
+            compare_truth=bool(content.get("compare_truth", False)),
+        )
+
+
+class Reconstruction:
+    """The decoding of one capture, fed frame by frame.
+
+    `add` each frame as it arrives, then `finish` with the closed folder. A frame that was taken again after it was
+    added makes `finish` decode from the folder: retakes are rare, and sums cannot forget.
+    """
+
+    def __init__(self, header: CaptureHeader, calibration: Calibration | None, options: DecodeOptions) -> None:
+        """Raise DecodeError or CalibrationError at once where these frames cannot become a scan."""
+        if calibration is not None and calibration.camera.size != (header.camera.width, header.camera.height):
+            width, height = calibration.camera.size
+            raise CalibrationError(
+                f"the calibration is for a camera of {width} x {height}, "
+                f"the frames are {header.camera.width} x {header.camera.height}",
+                hint="use the calibration made with this camera and region",
+            )
+        self._header = header
+        self._calibration = calibration
+        self._options = options
+        self._timings: dict[str, float] = {}
+        self._decoder = self._new_decoder()
+        self._slots: dict[int, int | None] = {}
+
+    def add(self, pattern: int, frame: Pixels, slot: int | None = None) -> None:
+        """Take one frame.
+
+        Args:
+            pattern: repetition x patterns + position; only the first repetition is decoded.
+            frame: (H, W) uint8 or uint16; not kept.
+            slot: its slot in the folder.
+        """
+        if pattern >= len(self._header.sequence):
+            return
+        if pattern not in self._slots:
+            with self._timed("decode frames"):
+                self._decoder.add(pattern, frame)
+            self._slots[pattern] = slot
+
+    def finish(self, capture: Capture, progress: Progress | None = None) -> Scan:
+        """The scan, once the folder is closed (or interrupted).
+
+        Raises:
+            SyncError: the frames are out of step.
+            DecodeError: they cannot be decoded.
+            CalibrationError: the rig cannot triangulate this pattern's axis.
+        """
+        tell = progress or (lambda _: None)
+        tell("checking frames")
+        with self._timed("check"):
+            check = check_capture(capture)
+            check.raise_if_out_of_step()
+        self._catch_up(capture)
+        tell("decoding")
+        with self._timed("decode"):
+            decoded = self._decoder.finish()
+        tell("triangulating")
+        scan = build_scan(decoded, self._calibration, self._options.filters, timings=self._timings)
+        scan = scan.with_report(sync=check.as_dict(), capture=self._capture_report(capture))
+        if self._options.compare_truth:
+            tell("comparing with truth")
+            scan = self._compared(scan, capture)
+        return scan
+
+    def _catch_up(self, capture: Capture) -> None:
+        count = len(self._header.sequence)
+        present = {pattern: record.slot for pattern, record in capture.records.items() if pattern < count}
+        stale = any(slot is not None and present.get(pattern) != slot for pattern, slot in self._slots.items())
+        if stale or self._slots.keys() - present.keys():
+            self._decoder = self._new_decoder()
+            self._slots = {}
+        for pattern, slot in present.items():
+            if pattern not in self._slots:
+                self.add(pattern, capture.frame(pattern), slot)
+
+    def _new_decoder(self) -> Decoder:
+        return decoder_for(self._header.sequence, self._header.camera, self._options.decoder)
+
+    def _capture_report(self, capture: Capture) -> dict[str, Any]:
+        header = capture.header
+        return {
+            "id": header.id,
+            "created": header.created,
+            "method": header.sequence.pattern.method,
+            "frames": len(capture.records),
+            "missing": list(capture.missing),
+            "state": header.state,
+            "reason": header.reason,
+            "repeat": header.repeat,
+        }
+
+    def _compared(self, scan: Scan, capture: Capture) -> Scan:
+        with self._timed("compare"):
+            comparison = compare(scan, load_truth(capture.path))
+        return replace(scan.with_report(truth=comparison.as_dict()), error_map=comparison.picture())
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._timings[stage] = self._timings.get(stage, 0.0) + time.perf_counter() - begin
+
+
+def reconstruct(
+    capture: Capture,
+    calibration: Calibration | None,
+    options: DecodeOptions | None = None,
+    progress: Progress | None = None,
+) -> Scan:
+    """Decode a folder, all at once.
+
+    Raises:
+        SyncError, DecodeError, CalibrationError: see `Reconstruction.finish`.
+    """
+    tell = progress or (lambda _: None)
+    tell("reading frames")
+    reconstruction = Reconstruction(capture.header, calibration, options or DecodeOptions())
+    for pattern, record in capture.records.items():
+        reconstruction.add(pattern, capture.frame(pattern), record.slot)
+    return reconstruction.finish(capture, progress)
+
+
+def calibration_for(capture: Capture, given: Path | None = None) -> Calibration | None:
+    """The calibration to use: the given file, else the file the capture names, else none.
+
+    Raises:
+        CalibrationError: a file that is named is missing or unusable.
+    """
+    path = given if given is not None else capture.calibration_path
+    return None if path is None else load_calibration(path)
+
+
+def load_truth(folder: Path) -> Truth:
+    """The truth that a simulated rig left in its capture folder.
+
+    Raises:
+        DecodeError: there is none, or it is damaged.
+    """
+    path = folder / TRUTH_FILE
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            return Truth(content["rows"], content["columns"], content["xyz"], content["lit"])
+    except FileNotFoundError as error:
+        raise DecodeError(
+            f"{folder} has no {TRUTH_FILE}: the truth of this scene is not known",
+            hint="only simulated rigs know it: fringed scan --rig simulated --compare-truth",
+        ) from error
+    except (OSError, ValueError, KeyError) as error:
+        raise DecodeError(f"cannot read {path}: {error}") from error
+
