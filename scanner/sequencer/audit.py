@@ -44,7 +44,12 @@ class CaptureCheck:
         return summary(self.verdicts)
 
     def raise_if_out_of_step(self) -> CaptureCheck:
-        """Raise SyncError naming the frames if anything speaks against them; else return self."""
+        """Raise if anything speaks against the frames; else return self.
+
+        Raises:
+            SyncError: naming the frames.
+            DecodeError: nothing in view is lit.
+        """
         if not self.passed:
             raise sync_error(self.capture.header.sequence, self.verdicts, self.witnesses, self.suspects)
         return self

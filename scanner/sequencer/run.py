@@ -16,12 +16,12 @@ import numpy as np
 from scanner.capture import FrameRecord, Verdict
 from scanner.clock import Clock
 from scanner.devices import Camera, CameraFrame, CameraSettings, Flip, Image, Pixels, Projector, TriggerMode
-from scanner.errors import DeviceLost, ScannerError, SyncError
+from scanner.errors import DecodeError, DeviceLost, ScannerError, SyncError
 from scanner.patterns import FrameRole, PatternSequence
 from scanner.sequencer.plan import Mode, Plan, Rig
 from scanner.sequencer.thumbnail import thumbnail
 from scanner.sequencer.verify import FrameVerdict, judge, summary, verify
-from scanner.sequencer.witness import Witnesses, witness
+from scanner.sequencer.witness import DARK_HINT, Witnesses, witness
 
 
 class FrameSink(Protocol):
@@ -272,6 +272,8 @@ class _Run:
             again = self.doubtful()
             if not again:
                 return
+            if self.witnesses.dark:
+                break
             self.retakes += len(again)
             self.slots(again)
         if self.doubtful():
@@ -378,7 +380,7 @@ class _Run:
                 found.update(members)
         return found
 
-    def out_of_step(self) -> SyncError:
+    def out_of_step(self) -> ScannerError:
         suspects = sorted({v.pattern % self.plan.patterns for v in self.verdicts if v.suspect})
         return sync_error(self.sequence, self.verdicts, self.witnesses, suspects, self.retakes)
 
@@ -402,8 +404,10 @@ def sync_error(
     witnesses: Witnesses,
     suspects: Sequence[int],
     retakes: int = 0,
-) -> SyncError:
+) -> ScannerError:
     """The error that names the frames, says what spoke against them, and what to do."""
+    if witnesses.dark:
+        return DecodeError("nothing in the camera's view is lit by the projector", hint=DARK_HINT)
     frames = sorted(set(suspects) | set(witnesses.suspects))
     if witnesses.whole:
         frames = list(range(len(sequence)))
@@ -415,6 +419,5 @@ def sync_error(
     return SyncError(
         f"{named} out of step with the projector{tried}: {detail}",
         frames=frames,
-        hint=witnesses.hint
-        or "measure the projector's latency (fringed calibrate sync), and look at the timing diagram (fringed audit)",
+        hint="measure the projector's latency (fringed calibrate sync), and look at the timing diagram (fringed audit)",
     )

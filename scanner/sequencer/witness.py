@@ -1,18 +1,44 @@
-"""What the content of the frames says about their order: the witnesses. Pure: thumbnails in, findings out."""
+"""What the content of the frames says about their order: the witnesses. Pure: thumbnails in, findings out.
+
+Stamps can lie and latencies be wrong; what the frames show cannot. Here stand the findings themselves and the
+witnesses of full-on and full-off frames: sentinels, white and black. Those of fringe sets are in `witness_fringes`,
+those of Gray code in `witness_gray`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from scanner.devices import Pixels
-from scanner.patterns import PatternSequence
+from scanner.patterns import FrameRole, PatternSequence
+from scanner.patterns.sequence import SENTINELS_AFTER, SENTINELS_BEFORE
+
+SENTINEL_TOLERANCE = 0.08
+"""Share of the contrast by which equal sentinels may differ. Lamps drift by 1-3 % in seconds and mains light adds as
+much; a blend of two patterns by this share moves a phase by 0.08 x 2 pi / N at most, far from half a fringe."""
+
+NOISE_SIGMAS = 5.0
+"""What is called lit, or different, stands this far above the noise."""
+
+LIT_SHARE = 0.15
+"""Of the contrast that the brightest half percent reaches: what is darker is scattered light more than pattern."""
+
+LEAST_NOISE = 12**-0.5
+"""Grey levels: rounding to whole levels."""
+
+DARK_HINT = "is the lens cap off, the projector on and awake, and the exposure long enough? Look at fringed preview"
+
+Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Witness:
-    """One finding. `value` is held against `limit`; `frames` are positions."""
+    """One finding. `value` is held against `limit`; `frames` are the positions it speaks against."""
 
     name: str
     passed: bool
@@ -41,7 +67,8 @@ class Witnesses:
 
     items: tuple[Witness, ...] = ()
     cannot_reveal: tuple[str, ...] = ()
-    hint: str | None = None
+    dark: bool = False
+    """nothing in view is lit by the projector: there is nothing to judge, nor to decode"""
 
     @property
     def suspects(self) -> tuple[int, ...]:
@@ -56,16 +83,37 @@ class Witnesses:
     @property
     def passed(self) -> bool:
         """Whether nothing speaks against the plan."""
-        return all(item.passed for item in self.items)
+        return not self.dark and all(item.passed for item in self.items)
 
     def joined(self, other: Witnesses) -> Witnesses:
         """The findings of two repetitions together."""
         cannot = tuple(dict.fromkeys((*self.cannot_reveal, *other.cannot_reveal)))
-        return Witnesses((*self.items, *other.items), cannot, self.hint or other.hint)
+        return Witnesses((*self.items, *other.items), cannot, self.dark or other.dark)
 
     def as_list(self) -> list[dict[str, Any]]:
         """Plain data for capture.json's `witnesses`."""
         return [item.as_dict() for item in self.items]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The thumbnails of one repetition as samples, and what all witnesses need to know of them."""
+
+    sequence: PatternSequence
+    frames: Mapping[int, Array]
+    """by position: (P,) float32 grey levels"""
+    shape: tuple[int, int]
+    max_value: int
+    noise: float
+    """1-sigma of one sample, grey levels"""
+    lit: NDArray[np.bool_]
+    """(P,) pixels that the projector's light reaches"""
+    contrast: float
+    """what that light adds to the brightest half percent of pixels, grey levels"""
+
+    def mean(self, position: int) -> float:
+        """Mean level of a frame over the lit pixels."""
+        return float(self.frames[position][self.lit].mean())
 
 
 def witness(sequence: PatternSequence, thumbnails: Mapping[int, Pixels], max_value: int) -> Witnesses:
@@ -74,6 +122,156 @@ def witness(sequence: PatternSequence, thumbnails: Mapping[int, Pixels], max_val
     Args:
         thumbnails: by position, (h, w) uint8 or uint16 each, all of one size; absent positions are missing frames.
         max_value: the camera's largest grey level.
+
+    Returns:
+        Every witness this sequence has. One-frame sequences have none, and nothing is revealed.
     """
-    found: Sequence[Witness] = ()
-    return Witnesses(tuple(found))
+    # The method's own witnesses build on the findings here.
+    from scanner.sequencer.witness_fringes import fringe_witnesses  # noqa: PLC0415
+    from scanner.sequencer.witness_gray import gray_witnesses  # noqa: PLC0415
+
+    if len(sequence) < 2 or len(thumbnails) < 2:
+        return Witnesses(cannot_reveal=("any fault of order: one frame has no order",))
+    scene = look(sequence, thumbnails, max_value)
+    if scene is None:
+        return Witnesses(
+            (Witness("light", False, 0.0, 0.0, says="no pixel changes with the projector's pattern"),), dark=True
+        )
+    items: list[Witness] = []
+    cannot: list[str] = []
+    items += _sentinels(scene, cannot)
+    items += _white_and_black(scene)
+    if sequence.pattern.method == "pmp":
+        items += fringe_witnesses(scene, cannot)
+    elif sequence.pattern.method == "gray":
+        items += gray_witnesses(scene, cannot)
+    return Witnesses(tuple(items), tuple(cannot))
+
+
+def look(sequence: PatternSequence, thumbnails: Mapping[int, Pixels], max_value: int) -> Scene | None:
+    """Take the thumbnails as samples: noise, lit pixels. None if no pixel changes beyond the noise."""
+    frames = {p: pixels.reshape(-1).astype(np.float32) for p, pixels in sorted(thumbnails.items())}
+    shape = next(iter(thumbnails.values())).shape
+    noise = _noise(sequence, frames)
+    stack = np.stack(list(frames.values()))
+    # The second largest minus the second smallest: one frame's outliers (a cosmic ray, a torn frame) light nothing.
+    ranked = np.sort(stack, axis=0)
+    spread = ranked[-2] - ranked[1] if len(stack) > 4 else ranked[-1] - ranked[0]
+    contrast = float(np.quantile(spread, 0.995))
+    # n normal samples range over about 2 sqrt(2 ln n) sigma.
+    range_of_noise = 2 * float(np.sqrt(2 * np.log(len(stack)))) * noise
+    if contrast < range_of_noise + NOISE_SIGMAS * noise:
+        return None
+    lit = spread > max(LIT_SHARE * contrast, range_of_noise + NOISE_SIGMAS * noise / 2)
+    return Scene(sequence, frames, (int(shape[0]), int(shape[1])), max_value, noise, lit, contrast)
+
+
+def difference_noise(a: Array, b: Array) -> float:
+    """1-sigma of one sample, from two frames of one picture: median absolute difference / (0.6745 sqrt 2)."""
+    return float(np.median(np.abs(a - b))) / 0.9539
+
+
+def equal_positions(sequence: PatternSequence) -> Iterable[tuple[float, tuple[int, ...]]]:
+    """(light, positions) of the full-off and the full-on frames."""
+    levels: dict[float, list[int]] = {0.0: [], 1.0: []}
+    for position, level in zip(sequence.sentinels, SENTINELS_BEFORE + SENTINELS_AFTER, strict=False):
+        levels[level].append(position)
+    if sequence.black is not None:
+        levels[0.0].append(sequence.black)
+    if sequence.white is not None:
+        levels[1.0].append(sequence.white)
+    return [(level, tuple(sorted(positions))) for level, positions in levels.items()]
+
+
+def _noise(sequence: PatternSequence, frames: Mapping[int, Array]) -> float:
+    """Of the pairs of equal frames, full-on ones first since they are the noisier, the pair that differs least.
+
+    Without such pairs: of all pairs of frames, in pixels that no pattern reaches if there are any. A rolled-over
+    estimate is never below rounding.
+    """
+    for light, positions in sorted(equal_positions(sequence), reverse=True):
+        here = [p for p in positions if p in frames]
+        found = [difference_noise(frames[a], frames[b]) for i, a in enumerate(here) for b in here[i + 1 :]]
+        if found and (light == 1.0 or min(found) > 0):
+            return max(min(found), LEAST_NOISE)
+    # Third differences of the darkest quarter's levels over time: scattered pattern light is small there.
+    stack = np.stack(list(frames.values()))
+    dark = stack.mean(axis=0) <= np.quantile(stack.mean(axis=0), 0.25)
+    return max(float(np.median(np.abs(np.diff(stack[:, dark], axis=0)))) / 0.9539, LEAST_NOISE)
+
+
+# --- full-on and full-off frames ----------------------------------------------------------------------------------
+
+
+def _sentinels(scene: Scene, cannot: list[str]) -> list[Witness]:
+    """Levels and order of the sentinels: latency, direction, blends, and shifts of the whole sequence."""
+    sequence = scene.sequence
+    planned = dict(zip(sequence.sentinels, SENTINELS_BEFORE + SENTINELS_AFTER, strict=False))
+    here = [p for p in sequence.sentinels if p in scene.frames]
+    if len(here) < 4:
+        cannot.append("frames that all come late by whole patterns (no sentinels)")
+        return []
+    levels = _levels(scene, planned)
+    wrong = [p for p in here if abs(levels[p] - planned[p]) > SENTINEL_TOLERANCE]
+    value = max(abs(levels[p] - planned[p]) for p in here)
+    if not wrong:
+        return [Witness("sentinels", True, value, SENTINEL_TOLERANCE, says="black and white frames are where planned")]
+    says, whole = _explain_sentinels(scene, levels, planned, wrong)
+    return [Witness("sentinels", False, value, SENTINEL_TOLERANCE, tuple(wrong), says, whole)]
+
+
+def _levels(scene: Scene, planned: Mapping[int, float]) -> dict[int, float]:
+    """Level of every frame, 0 = black, 1 = white, over the lit pixels.
+
+    The scale is set by the medians of planned blacks and whites if these stand apart, so that one false sentinel does
+    not move it; else by the darkest and brightest frame there is.
+    """
+    means = {p: scene.mean(p) for p in scene.frames}
+    black = float(np.median([means[p] for p, level in planned.items() if level == 0 and p in means] or [np.nan]))
+    white = float(np.median([means[p] for p, level in planned.items() if level == 1 and p in means] or [np.nan]))
+    low, high = min(means.values()), max(means.values())
+    if not white - black > 0.75 * (high - low):
+        black, white = low, high
+    return {p: (mean - black) / max(white - black, 1e-6) for p, mean in means.items()}
+
+
+def _explain_sentinels(
+    scene: Scene, levels: Mapping[int, float], planned: Mapping[int, float], wrong: Sequence[int]
+) -> tuple[str, bool]:
+    """What kind of disorder it is, and whether it concerns the whole sequence."""
+    sequence, tolerance = scene.sequence, 2 * SENTINEL_TOLERANCE
+    here = [p for p in sequence.sentinels if p in levels]
+    if all(abs(levels[p] - (1 - planned[p])) < tolerance for p in here):
+        return "the sequence runs backwards: sentinels are white where black was shown and the other way round", True
+    for lag in (1, -1, 2, -2):
+        # Beyond the sequence's ends nothing is known; among the fringes the mean lies between.
+        expected = {p: planned[p - lag] for p in here if p - lag in planned}
+        if len(expected) >= 3 and all(abs(levels[p] - level) < tolerance for p, level in expected.items()):
+            side = "before" if lag > 0 else "after"
+            count = "the pattern" if abs(lag) == 1 else f"the pattern {abs(lag)} places"
+            return f"every frame shows {count} {side} its own: light comes later or earlier than planned", True
+    if len(wrong) == 1:
+        return f"sentinel {wrong[0]} is at {levels[wrong[0]]:.0%} of white, planned {planned[wrong[0]]:.0%}", False
+    partial = [p for p in wrong if tolerance < levels[p] < 1 - tolerance]
+    if len(partial) >= 2:
+        named = ", ".join(f"{p} at {levels[p]:.0%}" for p in partial)
+        return f"sentinels are blends of two patterns ({named} of white): exposures straddle the flips", True
+    return f"sentinels {', '.join(map(str, wrong))} do not show the black or white that was planned", True
+
+
+def _white_and_black(scene: Scene) -> list[Witness]:
+    """The method's own white and black frame: they must bound all others."""
+    sequence = scene.sequence
+    white, black = sequence.white, sequence.black
+    if white is None or black is None or white not in scene.frames or black not in scene.frames:
+        return []
+    others = [scene.mean(p) for p in scene.frames if sequence.role(p) in (FrameRole.FRINGE, FrameRole.BARS)]
+    span = scene.mean(white) - scene.mean(black)
+    middle = float(np.median(others)) - scene.mean(black) if others else span / 2
+    if span <= 0:
+        return [Witness("white and black", False, span, 0.0, (white, black), "white is not brighter than black")]
+    share = middle / span
+    # Every code or fringe image is half lit; a response bent by gamma 2.2 leaves a third.
+    passed = 0.15 < share < 0.95
+    says = f"the other frames are at {share:.0%} between black and white"
+    return [Witness("white and black", passed, share, 0.95, () if passed else (white, black), says)]

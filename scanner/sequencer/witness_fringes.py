@@ -1,0 +1,447 @@
+"""Witnesses of fringe sets: the residual of each fit, the sets' means, the remainder between sets, order bars, copies.
+
+Each sees what the others cannot. The residual names swapped, doubled and foreign frames of sets of four shifts or
+more; the mean of a set does so for three. A set that was rotated or reversed as a whole leaves no residual: the
+remainder between sets shows it, unless all sets turned alike and their frequencies hide it; then the order bars speak,
+which hold one absolute position however few shifts there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode.pmp_witness import MAX_DISORDER, set_witness
+from scanner.decode.unwrapping import Ladder, plan_ladder
+from scanner.errors import DecodeError
+from scanner.patterns import PmpPattern
+from scanner.patterns.description import Axis
+from scanner.patterns.pmp import FringeSet
+from scanner.patterns.sequence import BAR_COUNT, bar_light
+from scanner.sequencer.witness import NOISE_SIGMAS, Array, Scene, Witness
+
+MIN_PIXELS = 150
+"""Lit pixels of the thumbnail, fewer than which prove nothing."""
+
+MAX_RESIDUAL = 0.35
+"""Residual over B where its cause cannot be told from the response by phase. Uncorrected gamma 2.2 leaves .2."""
+
+SWAP_GAIN = 0.35
+"""An exchange of two frames is believed when it brings the residual down to this share of what it was."""
+
+MAX_MEAN_DIFFERENCE = 0.2
+"""Of a set's mean from the others', rms over B, gain taken out. A doubled frame among three leaves .41; the third
+harmonic of an uncorrected gamma 2.2 leaves .05."""
+
+HYPOTHESIS_GAIN = 0.35
+"""A turned set is believed when it makes the remainders agree by so much better (mean cosine)."""
+
+MIN_BARS_AGREEMENT = 0.75
+"""Of pixels with the order bars: in step all but edges agree, any other order agrees in 15 of 31."""
+
+MIN_BARS_SEEN = 8
+"""Different bars in view, fewer than which could agree by chance (2^-8)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """One set's least-squares fit I_n = A + B cos(theta + alpha_n) over all samples."""
+
+    fringe_set: FringeSet
+    positions: tuple[int, ...]
+    """of the frames that are here"""
+    alpha: NDArray[np.float64]
+    frames: Array
+    """(N, P) grey levels"""
+    mean: Array
+    modulation: Array
+    cycles: Array
+    """(P,) theta / 2 pi"""
+
+    def model(self, n: int) -> Array:
+        """(P,) what frame n should show."""
+        angle = 2 * np.pi * self.cycles + np.float32(self.alpha[n])
+        return np.asarray(self.mean + self.modulation * np.cos(angle), dtype=np.float32)
+
+
+def fringe_witnesses(scene: Scene, cannot: list[str]) -> list[Witness]:
+    """All witnesses of a PMP capture."""
+    pattern = scene.sequence.pattern
+    if not isinstance(pattern, PmpPattern):
+        return []
+    fits = [fit for fringe_set in pattern.sets() if (fit := _fit(scene, pattern, fringe_set)) is not None]
+    clipped = _clipped(scene)
+    items = [item for fit in fits if (item := _residual(scene, fit, clipped)) is not None]
+    items += _means(scene, fits, clipped)
+    items += _copies(scene, fits)
+    suspected = {p for item in items if not item.passed for p in item.frames}
+    for axis in pattern.axes:
+        mine = [fit for fit in fits if fit.fringe_set.axis == axis]
+        items += _between_sets(scene, pattern, axis, mine, clipped, suspected, cannot)
+    if any(n == 3 for n in pattern.shifts):
+        cannot.append("blends of neighbouring patterns inside a set of three shifts, if small")
+    return items
+
+
+def _fit(scene: Scene, pattern: PmpPattern, fringe_set: FringeSet) -> Fit | None:
+    fringes = scene.sequence.fringes[fringe_set.first : fringe_set.first + fringe_set.shifts]
+    here = [n for n, p in enumerate(fringes) if p in scene.frames]
+    if len(here) < 3:
+        return None
+    alpha = pattern.sign * 2 * np.pi * np.asarray(here) / fringe_set.shifts + pattern.offset
+    frames = np.stack([scene.frames[fringes[n]] for n in here])
+    mean, cosine, sine = _solve(_design(alpha), frames)
+    cycles = np.arctan2(sine, cosine) / np.float32(2 * np.pi)
+    return Fit(fringe_set, tuple(fringes[n] for n in here), alpha, frames, mean, np.hypot(cosine, sine), cycles)
+
+
+def _design(alpha: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.stack([np.ones_like(alpha), np.cos(alpha), -np.sin(alpha)], axis=1)
+
+
+def _solve(design: NDArray[np.float64], frames: Array) -> Array:
+    return np.asarray(np.linalg.pinv(design).astype(np.float32) @ frames)
+
+
+def _clipped(scene: Scene) -> NDArray[np.bool_]:
+    top = np.max([scene.frames[p] for p in scene.sequence.fringes if p in scene.frames], axis=0)
+    return np.asarray(top >= scene.max_value)
+
+
+def _bright(scene: Scene, fit: Fit, clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels with a modulation well above its noise, and not clipped."""
+    b = fit.modulation
+    sigma = scene.noise * float(np.sqrt(2 / len(fit.positions)))
+    return scene.lit & ~clipped & (b > NOISE_SIGMAS * sigma) & (b > 0.25 * float(np.quantile(b, 0.99)))
+
+
+def _name(fringe_set: FringeSet) -> str:
+    return f"frequency {fringe_set.frequency:g} along {fringe_set.axis}"
+
+
+# --- one set ------------------------------------------------------------------------------------------------------
+
+
+def _residual(scene: Scene, fit: Fit, clipped: NDArray[np.bool_]) -> Witness | None:
+    """What the fit leaves: by phase where the scene shows all phases, else against exchanges of frames."""
+    count = len(fit.positions)
+    bright = _bright(scene, fit, clipped)
+    if count < 4 or np.count_nonzero(bright) < MIN_PIXELS:
+        return None
+    name = f"residual {fit.fringe_set.frequency:g}{fit.fringe_set.axis}"
+    design = _design(fit.alpha)
+    seen = set_witness(fit.fringe_set, fit.positions, fit.frames[:, bright], design, clipped[bright])
+    if seen.disorder is not None and seen.disorder > MAX_DISORDER:
+        says = f"{_name(fit.fringe_set)} does not fit a sinusoid: {seen.disorder:.2f} B that no response explains"
+        return Witness(name, False, seen.disorder, MAX_DISORDER, seen.suspects, says)
+    b = fit.modulation[bright]
+    left = _rms(design, fit.frames[:, bright], b)
+    noise = scene.noise / float(np.median(b))
+    if left > 3 * noise and (exchange := _exchange(design, fit.frames[:, bright], b, left)) is not None:
+        frames = tuple(sorted(fit.positions[n] for n in exchange))
+        says = f"{_name(fit.fringe_set)} fits with frames {frames[0]} and {frames[1]} exchanged, and not as it is"
+        return Witness(name, False, left, SWAP_GAIN * left, frames, says)
+    if left > MAX_RESIDUAL + noise:
+        frames = _odd_one_out(fit, bright, left)
+        says = f"{_name(fit.fringe_set)} does not fit a sinusoid: {left:.2f} B is left"
+        return Witness(name, False, left, MAX_RESIDUAL, frames, says)
+    value = left if seen.disorder is None else seen.disorder
+    limit = MAX_RESIDUAL if seen.disorder is None else MAX_DISORDER
+    return Witness(name, True, value, limit, says=f"{_name(fit.fringe_set)} fits a sinusoid")
+
+
+def _rms(design: NDArray[np.float64], frames: Array, b: Array) -> float:
+    """Residual over B, rms over frames, median over pixels."""
+    left = (frames - design.astype(np.float32) @ _solve(design, frames)) / b
+    return float(np.sqrt(np.median((left**2).sum(axis=0)) / max(len(frames) - 3, 1)))
+
+
+def _exchange(design: NDArray[np.float64], frames: Array, b: Array, left: float) -> tuple[int, int] | None:
+    """The exchange of two frames after which the set fits, if one does and no other does as well."""
+    stride = max(1, frames.shape[1] // 2000)
+    sample, weights = frames[:, ::stride], b[::stride]
+    found = []
+    for i, j in combinations(range(len(frames)), 2):
+        order = list(range(len(frames)))
+        order[i], order[j] = order[j], order[i]
+        found.append((_rms(design, sample[order], weights), (i, j)))
+    found.sort()
+    return found[0][1] if found[0][0] < SWAP_GAIN * left else None
+
+
+def _odd_one_out(fit: Fit, bright: NDArray[np.bool_], left: float) -> tuple[int, ...]:
+    """The frame without which the others fit; all of them where none is, or where too few would be left to tell."""
+    count = len(fit.positions)
+    if count < 5:
+        return fit.positions
+    b = fit.modulation[bright]
+    tried = []
+    for n in range(count):
+        keep = [i for i in range(count) if i != n]
+        tried.append((_rms(_design(fit.alpha[keep]), fit.frames[keep][:, bright], b), n))
+    best, n = min(tried)
+    return (fit.positions[n],) if best < SWAP_GAIN * left else fit.positions
+
+
+def _means(scene: Scene, fits: Sequence[Fit], clipped: NDArray[np.bool_]) -> list[Witness]:
+    """Equal mean light of all sets, pixel by pixel: the only check inside a set of three."""
+    if len(fits) < 2:
+        return []
+    use = np.logical_and.reduce([_bright(scene, fit, clipped) for fit in fits])
+    if np.count_nonzero(use) < MIN_PIXELS:
+        return []
+    means = np.stack([fit.mean[use] for fit in fits])
+    reference = np.median(means, axis=0) if len(fits) > 2 else means.mean(axis=0)
+    b = np.median(np.stack([fit.modulation[use] for fit in fits]), axis=0)
+    # Lamps drift and mains light beats: one gain a set is taken out; disorder differs from pixel to pixel.
+    gains = np.median(means / np.maximum(reference, 1), axis=1, keepdims=True)
+    value = np.sqrt(np.median(((means - gains * reference) / b) ** 2, axis=1)) / 0.6745
+    noise = scene.noise / float(np.median(b)) / np.sqrt([len(fit.positions) for fit in fits])
+    # Of two sets each stands half way to the other's error.
+    limit = MAX_MEAN_DIFFERENCE / (1 if len(fits) > 2 else 2) + 3 * noise
+    wrong = [fits[int(i)] for i in np.flatnonzero(value > limit)]
+    frames = tuple(sorted(p for fit in wrong for p in fit.positions))
+    worst = int(np.argmax(value / limit))
+    if not wrong:
+        return [Witness("equal means", True, float(value[worst]), float(limit[worst]), says="sets have equal means")]
+    says = f"{', '.join(_name(fit.fringe_set) for fit in wrong)}: mean light unlike that of the other sets"
+    return [Witness("equal means", False, float(value[worst]), float(limit[worst]), frames, says)]
+
+
+def _copies(scene: Scene, fits: Sequence[Fit]) -> list[Witness]:
+    """Frames of different patterns that are one picture: a stale buffer, a doubled frame, a flip that never came."""
+    noise = 0.9539 * scene.noise
+    frames: dict[int, int] = {}
+    nearest = np.inf
+    for f, fit in enumerate(fits):
+        use = scene.lit & (fit.modulation > 4 * scene.noise)
+        if np.count_nonzero(use) < MIN_PIXELS:
+            continue
+        own = _varied(fit, use)
+        for later in fits[f:]:
+            if later is not fit and not (own and _varied(later, use)):
+                continue
+            for i, j in _pairs(fit, later):
+                difference = float(np.median(np.abs(fit.frames[i][use] - later.frames[j][use])))
+                expected = 8 * noise
+                if later is fit:
+                    expected = float(np.median(np.abs(fit.model(i)[use] - fit.model(j)[use])))
+                if expected < 4 * noise:
+                    continue
+                nearest = min(nearest, difference / noise)
+                if difference <= min(1.5 * noise, 0.25 * expected):
+                    frames[later.positions[j]] = fit.positions[i]
+    if not np.isfinite(nearest):
+        return []
+    named = ", ".join(f"{later} of {earlier}" for later, earlier in sorted(frames.items()))
+    says = f"copies of an earlier frame: {named}" if frames else "all frames differ"
+    return [Witness("copies", not frames, nearest, 1.5, tuple(sorted(frames)), says)]
+
+
+def _varied(fit: Fit, use: NDArray[np.bool_]) -> bool:
+    """Whether the scene shows enough of the set's phases for two frames not to be alike by chance."""
+    vector = np.exp(2j * np.pi * fit.cycles[use]).mean()
+    return bool(np.abs(vector) < 0.9)
+
+
+def _pairs(fit: Fit, later: Fit) -> list[tuple[int, int]]:
+    if later is fit:
+        return list(combinations(range(len(fit.positions)), 2))
+    if (fit.fringe_set.axis, fit.fringe_set.frequency) == (later.fringe_set.axis, later.fringe_set.frequency):
+        return []
+    return [(i, j) for i in range(len(fit.positions)) for j in range(len(later.positions))]
+
+
+# --- sets against one another, and against the bars -----------------------------------------------------------------
+
+
+def _between_sets(
+    scene: Scene,
+    pattern: PmpPattern,
+    axis: Axis,
+    fits: Sequence[Fit],
+    clipped: NDArray[np.bool_],
+    suspected: set[int],
+    cannot: list[str],
+) -> list[Witness]:
+    if len(fits) < len(pattern.frequencies) or not fits:
+        cannot.append(f"rotations of sets along {axis} (sets are missing)")
+        return []
+    if suspected & {p for fit in fits for p in fit.positions}:
+        # Phases of a set with a foreign frame prove nothing against other sets.
+        return []
+    use = np.logical_and.reduce([_bright(scene, fit, clipped) for fit in fits])
+    if np.count_nonzero(use) < MIN_PIXELS:
+        cannot.append(f"rotations and reversals of sets along {axis} (too few pixels show all of them)")
+        return []
+    try:
+        ladder = plan_ladder(pattern.frequencies, [2 / n for n in pattern.shifts])
+    except DecodeError:
+        cannot.append(f"rotations of sets along {axis} (frequencies without a common period)")
+        return []
+    cycles = np.stack([fit.cycles[use].astype(np.float64) for fit in fits])
+    centre = 0.5 + (pattern.origin - 0.5) / scene.sequence.projector.along(axis)
+    items = _remainders(scene, pattern, fits, ladder, cycles, use, centre, cannot)
+    if all(item.passed for item in items):
+        items += _bars(scene, pattern, axis, fits, ladder, cycles, use, centre, cannot)
+    return items
+
+
+def climb(
+    ladder: Ladder, cycles: NDArray[np.float64], centre: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Unwrap up the ladder. cycles: (K, P) of each set. Returns field fractions (P,) and remainders (steps, P)."""
+    m, f = ladder.combinations.astype(np.float64), ladder.frequencies
+    absolute = m[0] @ cycles
+    absolute = absolute - np.rint(absolute - f[0] * centre)
+    left = np.zeros((len(f) - 1, cycles.shape[1]))
+    for j in range(len(f) - 1):
+        psi = m[j + 1] @ cycles
+        difference = f[j + 1] / f[j] * absolute - psi
+        order = np.rint(difference)
+        left[j] = difference - order
+        absolute = psi + order
+    return absolute / f[-1], left
+
+
+def _remainders(
+    scene: Scene,
+    pattern: PmpPattern,
+    fits: Sequence[Fit],
+    ladder: Ladder,
+    cycles: NDArray[np.float64],
+    use: NDArray[np.bool_],
+    centre: float,
+    cannot: list[str],
+) -> list[Witness]:
+    """Neighbouring rungs must agree over the whole image; if they do not, which turned set would make them?"""
+    if len(ladder.frequencies) < 2:
+        if not scene.sequence.bars:
+            cannot.append("a rotation or reversal of the only set (no other frequency, no bars)")
+        return []
+    vectors = _agreement(ladder, cycles, centre)
+    shifts = [fit.fringe_set.shifts for fit in fits]
+    best, turned = _best_turn(pattern, ladder, cycles, centre, shifts)
+    score = float(vectors.real.mean())
+    axis = fits[0].fringe_set.axis
+    if turned and best > score + HYPOTHESIS_GAIN:
+        frames = tuple(sorted(p for k in turned for p in fits[k].positions))
+        named = " or ".join(f"{fits[k].fringe_set.frequency:g}" for k in turned)
+        says = f"frequency {named} along {axis} is out of step: its frames are rotated or reversed"
+        return [Witness(f"remainder {axis}", False, score, best - HYPOTHESIS_GAIN, frames, says)]
+    noise2 = [(scene.noise / float(np.median(fit.modulation[use]))) ** 2 * 2 / n / (4 * np.pi**2)
+              for fit, n in zip(fits, shifts, strict=True)]  # fmt: skip
+    items = []
+    for j, (errors, vector) in enumerate(zip(ladder.errors, vectors, strict=True)):
+        concerned = [k for k, weight in enumerate(errors) if abs(weight) > 1e-9]
+        expected = float(np.exp(-2 * np.pi**2 * np.sum(errors**2 * noise2)))
+        items.append(_step(fits, ladder, j, vector, expected, concerned, cannot))
+    return items
+
+
+def _step(
+    fits: Sequence[Fit],
+    ladder: Ladder,
+    j: int,
+    vector: complex,
+    expected: float,
+    concerned: Sequence[int],
+    cannot: list[str],
+) -> Witness:
+    low, high = ladder.frequencies[j], ladder.frequencies[j + 1]
+    axis = fits[0].fringe_set.axis
+    name = f"remainder {low:g}:{high:g} {axis}"
+    # Half a frame's step of the set with most shifts; sets of few shifts have response errors, and move far.
+    limit = max(0.05, 0.5 / max(fits[k].fringe_set.shifts for k in concerned))
+    offset, length = float(np.angle(vector)) / (2 * np.pi), float(np.abs(vector))
+    frames = tuple(sorted(p for k in concerned for p in fits[k].positions))
+    if length > 0.5:
+        passed = abs(offset) <= limit
+        says = f"frequencies {low:g} and {high:g} along {axis} disagree by {offset:+.3f} of a fringe over the image"
+        return Witness(name, passed, abs(offset), limit, () if passed else frames, says)
+    few = min(fits[k].fringe_set.shifts for k in concerned)
+    if expected > 0.8 and length < 0.2 and few > 3:
+        says = f"frequencies {low:g} and {high:g} along {axis} have nothing to do with one another"
+        return Witness(name, False, length, 0.2, frames, says)
+    cannot.append(f"a rotation of frequency {low:g} or {high:g} along {axis} (their remainder is too noisy)")
+    return Witness(name, True, length, 0.2, says="too noisy to judge")
+
+
+def _agreement(ladder: Ladder, cycles: NDArray[np.float64], centre: float) -> NDArray[np.complex128]:
+    """(steps,) mean vectors of the remainders; 1 where all pixels agree."""
+    return np.asarray(np.exp(2j * np.pi * climb(ladder, cycles, centre)[1]).mean(axis=1))
+
+
+def _best_turn(
+    pattern: PmpPattern, ladder: Ladder, cycles: NDArray[np.float64], centre: float, shifts: Sequence[int]
+) -> tuple[float, tuple[int, ...]]:
+    """The best agreement that one rotated or reversed set would give, and the sets that could be that one."""
+    sample = cycles[:, :: max(1, cycles.shape[1] // 1500)]
+    scores = np.full(len(shifts), -1.0)
+    for k, count in enumerate(shifts):
+        for direction in (1, -1):
+            for turn in range(count):
+                if direction == 1 and turn == 0:
+                    continue
+                tried = sample.copy()
+                # Reversed frames n -> r - n measure -theta - 2 offset - sign r 2 pi / N; rotated ones theta + r / N.
+                fixed = -pattern.offset / np.pi if direction == -1 else 0.0
+                tried[k] = direction * tried[k] + fixed + turn / count
+                vectors = _agreement(ladder, tried, centre)
+                if vectors.real.min() > 0.5:
+                    scores[k] = max(scores[k], float(vectors.real.mean()))
+    best = float(scores.max())
+    return best, tuple(int(k) for k in np.flatnonzero((scores > best - 0.05) & (scores > 0)))
+
+
+def _bars(
+    scene: Scene,
+    pattern: PmpPattern,
+    axis: Axis,
+    fits: Sequence[Fit],
+    ladder: Ladder,
+    cycles: NDArray[np.float64],
+    use: NDArray[np.bool_],
+    centre: float,
+    cannot: list[str],
+) -> list[Witness]:
+    """The order bars against the positions that the fringes give."""
+    position = scene.sequence.bars.get(axis)
+    blind = f"sets along {axis} that are all rotated or reversed alike"
+    if position is None or position not in scene.frames:
+        cannot.append(f"{blind} (no order bars)")
+        return []
+    size = scene.sequence.projector.along(axis)
+    fraction, _ = climb(ladder, cycles, centre)
+    pixel = fraction * size - pattern.origin
+    # In the middle half of each bar neither blur nor a small error of position can change what is seen.
+    within = (pixel + 0.5) * BAR_COUNT / size
+    inner = (np.abs(within % 1 - 0.5) < 0.25) & (within > 0) & (within < BAR_COUNT)
+    # Noise of the first rung decides whether a pixel's bar is known at all.
+    weight = np.sum(ladder.combinations[0] ** 2 * [2 / fit.fringe_set.shifts for fit in fits])
+    b = np.min([fit.modulation[use] for fit in fits], axis=0)
+    sigma = scene.noise / b * float(np.sqrt(weight)) / (2 * np.pi) / ladder.frequencies[0] * BAR_COUNT
+    inner &= sigma < 0.5
+    seen = np.unique(np.floor(within[inner]).astype(int))
+    if np.count_nonzero(inner) < MIN_PIXELS or len(seen) < MIN_BARS_SEEN:
+        cannot.append(f"{blind} (the scene shows {len(seen)} of {BAR_COUNT} order bars)")
+        return []
+    expected = bar_light(pixel[inner], size) > 0.5
+    mean = np.median([fit.mean[use] for fit in fits], axis=0)
+    above = (scene.frames[position][use] - mean)[inner]
+    contrast = b[inner]
+    agrees = float(np.mean((above > 0) == expected))
+    name = f"order bars {axis}"
+    if agrees >= MIN_BARS_AGREEMENT:
+        return [Witness(name, True, agrees, MIN_BARS_AGREEMENT, says="the bars stand where the fringes say")]
+    binary = float(np.mean(np.abs(above) > 0.5 * contrast))
+    if binary < MIN_BARS_AGREEMENT:
+        says = "the frame of the order bars shows no bars"
+        return [Witness(name, False, agrees, MIN_BARS_AGREEMENT, (position,), says)]
+    frames = tuple(sorted({position, *(p for fit in fits for p in fit.positions)}))
+    says = f"{agrees:.0%} of pixels agree with the order bars along {axis}: all sets are rotated or reversed alike"
+    return [Witness(name, False, agrees, MIN_BARS_AGREEMENT, frames, says, whole=True)]
