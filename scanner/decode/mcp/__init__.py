@@ -1,0 +1,35 @@
+"""Modified Composite Pattern: one image to projector rows, by the default decoder.
+
+The pattern is Casey's (*Enhancements to the Modified Composite Pattern Method of Structured Light 3D Capture*,
+University of Kentucky 2011, sec. 2.1). The decoder follows the dissertation's chain, with each hard decision made
+soft:
+
+    stripes     pitch from the columns' spectrum; peaks and valleys in every fourth column      4.1
+    linking     peaks chained along the stripes; evidence passed along them                     (5.4 grows regions)
+    carriers    brightness along the chains; the magnification at which all carriers stand out  4.3
+    emissions   amplitude of each carrier over local brightness; likelihood of each stripe      4.4, 4.5
+    hmm         one model over both kinds of stripe: Viterbi and forward-backward               5.2, 5.3
+    subpixel    the profile averaged along the stripe, odd part fitted                          (not in the source)
+    dense       rows between the stripes; all maps                                              2.1, 3.7
+
+`decoder` puts them in order. What the dissertation's own decoder does is written down with its section numbers in
+each module; it is not this one.
+"""
+
+from __future__ import annotations
+
+from scanner.decode.mcp.decoder import McpDecoder, decode_image
+from scanner.patterns import CameraFormat, McpPattern, ProjectorSize
+
+__all__ = ["McpDecoder", "decode_image", "warm_up"]
+
+
+def warm_up() -> None:
+    """Call every kernel once with the types that frames have, so that no scan waits for a compiler."""
+    projector = ProjectorSize(160, 128)
+    pattern = McpPattern(bits=2, carriers=(20.0, 34.0), codes=(0, 1, 2, 3))
+    light = pattern.fringe(0, projector)
+    for bits in (8, 12):
+        camera = CameraFormat(projector.width, projector.height, bits)
+        frame = (10 + light * (0.8 * camera.max_value)).astype(camera.dtype)
+        decode_image(frame, pattern, projector, camera)

@@ -1,0 +1,434 @@
+"""The default MCP decoder: one image in, maps out; the stages in order.
+
+Vertical stripes (axis "x") are turned into horizontal ones at the door and back at the end, so that one code serves
+both phase directions.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode import Decoded, Reason
+from scanner.decode.mcp import carriers, dense, emissions, hmm, linking, stripes, subpixel
+from scanner.decode.mcp.model import PatternModel
+from scanner.errors import DecodeError
+from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
+
+Array = NDArray[np.float32]
+Image = NDArray[Any]
+
+ROUNDS = 3
+"""Passes of columns and stripes over one another; a fourth changed nothing on any scene tried."""
+
+VOTE_GAIN = 1.5
+"""Worth of the neighbours along a stripe, in votes of the peak itself."""
+
+POSTERIOR_FLOOR = 1e-4
+"""No vote against a stripe counts for more than this."""
+
+DECIDED = 0.9
+"""Posterior below which a peak stays undecided."""
+
+MIN_CHAIN_PX = 16
+"""Shorter pieces of stripe are left undecided: less than one period of a carrier, they have no code of their own."""
+
+SWITCH_COST = 6.0
+"""Natural logarithm of the odds against a change of stripe between two columns of one chain."""
+
+MIN_CONTRAST = 1.25
+"""Least ratio of a carrier's amplitude to what lies between the carriers, in the mean over the channels."""
+
+MIN_PITCH_MATCH = 0.35
+"""Least correlation of the image's and the pattern's spectrum along the phase direction."""
+
+
+def decode_image(
+    image: NDArray[np.uint8] | NDArray[np.uint16],
+    pattern: McpPattern,
+    projector: ProjectorSize,
+    camera: CameraFormat,
+) -> Decoded:
+    """Decode one image.
+
+    Args:
+        image: (H, W) uint8 or uint16, linear camera response, as captured.
+        pattern: what was projected.
+        projector: size of the projector's image.
+        camera: format of `image`.
+
+    Returns:
+        maps on the camera's grid. All NaN, with a warning, where stripes and carriers are there but no stripe could
+        be decided.
+
+    Raises:
+        DecodeError: no pattern, another pattern, one turned by 90 degrees, or stripes too fine for the camera.
+    """
+    pattern.validate(projector)
+    upright = _door(image, pattern, camera)
+    model = PatternModel.of(pattern, projector)
+    clock = _Stages()
+    found = _locate(upright, model, camera, clock)
+    if found.fault is not None:
+        _explain(found, upright, model, camera)
+    decided = _decide(found, model, clock)
+    decoded = None
+    if decided.agreement.holds:
+        decoded = _maps(upright, found, decided, model, clock)
+    else:
+        # The projector may hang upside down: then the stripes' order is reversed.
+        turned = np.ascontiguousarray(upright[::-1])
+        found = _locate(turned, model, camera, clock)
+        again = _decide(found, model, clock) if found.fault is None else decided
+        if again.agreement.holds:
+            decoded = _upside_down(_maps(turned, found, again, model, clock))
+    if decoded is None:
+        a = decided.agreement
+        raise DecodeError(
+            "stripes and carriers are there, but the codes contradict the description "
+            f"(of {a.clear:.0%} clear code words {a.agree:.0%} fit, {a.order:.0%} of neighbours are in order)",
+            hint="check bits, carriers, codes and axis of the description against what is projected",
+        )
+    return decoded if pattern.axis == "y" else _turned(decoded)
+
+
+class McpDecoder:
+    """Takes the one frame of an MCP sequence (and its white and black ones, if any) and decodes it.
+
+    Raises:
+        DecodeError: the sequence is not MCP.
+    """
+
+    def __init__(self, sequence: PatternSequence, camera: CameraFormat) -> None:
+        if not isinstance(sequence.pattern, McpPattern):
+            raise DecodeError(f"the MCP decoder was given method {sequence.pattern.method!r}")
+        self._sequence = sequence
+        self._pattern = sequence.pattern
+        self._camera = camera
+        self._seen: set[int] = set()
+        self._image: NDArray[Any] | None = None
+        self._black: NDArray[Any] | None = None
+
+    def add(self, position: int, frame: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+        """Take the frame at `position`; see `scanner.decode.Decoder`."""
+        if not 0 <= position < len(self._sequence):
+            raise DecodeError(f"frame {position} is not in a sequence of {len(self._sequence)}")
+        if position in self._seen:
+            raise DecodeError(f"frame {position} was given twice")
+        _check_frame(frame, self._camera, position)
+        self._seen.add(position)
+        if position == self._sequence.fringes[0]:
+            self._image = frame.copy()
+        elif position == self._sequence.black:
+            self._black = frame.copy()
+
+    def finish(self) -> Decoded:
+        """The maps; see `scanner.decode.Decoder`."""
+        if self._image is None:
+            raise DecodeError("the MCP frame is missing", hint=f"it is frame {self._sequence.fringes[0]}")
+        image = self._image
+        if self._black is not None:
+            image = cv2.subtract(image, self._black)
+        return decode_image(image, self._pattern, self._sequence.projector, self._camera)
+
+
+# --- the door -----------------------------------------------------------------------------------------------------
+
+
+def _check_frame(frame: NDArray[Any], camera: CameraFormat, position: int) -> None:
+    if frame.ndim != 2:
+        raise DecodeError(
+            f"frame {position} has shape {frame.shape}, expected one channel", hint="convert it to luma first"
+        )
+    if frame.shape != camera.shape:
+        raise DecodeError(
+            f"frame {position} is {frame.shape[1]} x {frame.shape[0]}, "
+            f"the camera's format is {camera.width} x {camera.height}"
+        )
+    if frame.dtype not in (np.uint8, np.uint16):
+        raise DecodeError(f"frame {position} has dtype {frame.dtype}, expected uint8 or uint16")
+
+
+_MOSAICS = {
+    "RGGB": cv2.COLOR_BayerRGGB2GRAY,
+    "BGGR": cv2.COLOR_BayerBGGR2GRAY,
+    "GRBG": cv2.COLOR_BayerGRBG2GRAY,
+    "GBRG": cv2.COLOR_BayerGBRG2GRAY,
+}
+
+
+def _door(image: NDArray[Any], pattern: McpPattern, camera: CameraFormat) -> Image:
+    """Checked, grey, with horizontal stripes, contiguous."""
+    _check_frame(image, camera, 0)
+    if camera.mosaic is not None:
+        if camera.mosaic not in _MOSAICS:
+            raise DecodeError(f"unknown mosaic {camera.mosaic!r}", hint=f"known: {', '.join(sorted(_MOSAICS))}")
+        image = cv2.cvtColor(image, _MOSAICS[camera.mosaic])
+    turned = image if pattern.axis == "y" else image.T
+    if min(turned.shape) < 32:
+        raise DecodeError(f"an image of {image.shape[1]} x {image.shape[0]} is smaller than a few stripes")
+    return np.ascontiguousarray(turned)
+
+
+class _Stages:
+    """Time of each stage, ms."""
+
+    def __init__(self) -> None:
+        self.ms: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        self.ms[name] = self.ms.get(name, 0.0) + 1e3 * (time.perf_counter() - begin)
+
+
+# --- is the pattern there, and at what size -----------------------------------------------------------------------
+
+
+@dataclass
+class _Found:
+    """What the search for stripes and carriers found; `fault` says why it is no pattern, if it is none."""
+
+    fault: str | None = None
+    hint: str | None = None
+    reduced: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    noise: float = 0.0
+    pitch: float = 0.0
+    match: float = 0.0
+    peaks: stripes.Peaks | None = None
+    chains: linking.Chains | None = None
+    signals: carriers.Signals | None = None
+    search: carriers.CarrierSearch | None = None
+
+
+def _locate(image: Image, model: PatternModel, camera: CameraFormat, clock: _Stages) -> _Found:
+    with clock.stage("columns"):
+        found = _Found(reduced=stripes.reduce_columns(image))
+        found.noise = max(stripes.noise_of(found.reduced), 1e-3)
+    low, high = (float(v) for v in np.percentile(found.reduced[::4, ::4], (1, 99)))
+    if high - low < max(0.01 * camera.max_value, 6 * found.noise):
+        state = "black" if high < 0.1 * camera.max_value else "saturated" if low > 0.9 * camera.max_value else "uniform"
+        found.fault = f"no pattern: the image is {state} (grey levels {low:.0f} to {high:.0f})"
+        found.hint = "check that the projector shows the pattern, its focus, and the exposure"
+        return found
+    with clock.stage("pitch"):
+        found.pitch, found.match = stripes.estimate_pitch(found.reduced, model)
+    if found.pitch < stripes.MIN_PITCH_PX:
+        found.fault = f"stripes are {found.pitch:.1f} px apart, too fine for this camera"
+        found.hint = "project fewer bits, or move the camera closer"
+        return found
+    if found.match < MIN_PITCH_MATCH:
+        found.fault = f"no stripes of this pattern (spectra agree to {found.match:.2f})"
+        return found
+    around = found.pitch / model.pitch
+    with clock.stage("peaks"):
+        found.peaks = stripes.find_peaks(found.reduced, found.pitch, around / float(model.carriers.min()), found.noise)
+    with clock.stage("chains"):
+        found.chains = linking.link(found.peaks, found.pitch)
+        found.signals = carriers.signals_along(image, found.peaks, found.chains, found.pitch, camera.max_value)
+    if len(found.peaks) == 0:
+        found.fault = "no stripes stand out of the noise"
+        return found
+    with clock.stage("carriers"):
+        found.search = carriers.search_carriers(found.signals, found.chains, model, around)
+    contrast = np.asarray(found.search.contrast)
+    if np.exp(np.log(np.maximum(contrast, 0.1)).mean()) < MIN_CONTRAST:
+        shown = ", ".join(f"{c:.2f}" for c in contrast)
+        found.fault = f"stripes {found.pitch:.1f} px apart, but not the carriers described (contrasts {shown})"
+        found.hint = "check bits and carriers of the description, and focus"
+    return found
+
+
+def _explain(found: _Found, image: Image, model: PatternModel, camera: CameraFormat) -> None:
+    """Raise what `_locate` found wrong; a pattern turned by 90 degrees is named."""
+    if found.pitch > 0:
+        other = _locate(np.ascontiguousarray(image.T), model, camera, _Stages())
+        if other.fault is None:
+            raise DecodeError(
+                "the pattern is turned by 90 degrees: its stripes run the other way",
+                hint='the other "axis" in the description, or turn projector or camera',
+            )
+    raise DecodeError(str(found.fault), hint=found.hint)
+
+
+# --- which stripe is it -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Decision:
+    """label (P,) int32, -1 undecided; confidence (P,); light (P,); fine positions; figures for the report."""
+
+    label: NDArray[np.int32]
+    confidence: Array
+    light: Array
+    fine: subpixel.Fine
+    agreement: emissions.Agreement
+    figures: dict[str, Any]
+
+
+def _decide(found: _Found, model: PatternModel, clock: _Stages) -> _Decision:
+    peaks, chains, search, signals = found.peaks, found.chains, found.search, found.signals
+    assert peaks is not None  # noqa: S101  (no fault means that the search went to its end)
+    assert chains is not None  # noqa: S101
+    assert search is not None  # noqa: S101
+    assert signals is not None  # noqa: S101
+    size = carriers.window_px(model, search.scale)
+    shape = (found.reduced.shape[1], found.reduced.shape[0] * stripes.STEP)
+    with clock.stage("field"):
+        scale_field = carriers.fit_field(signals.light, peaks, chains, model, search.scale, size, shape)
+    with clock.stage("emissions"):
+        seen = emissions.measure(signals.light, chains, scale_field, model, search.scale, size)
+    modulation = emissions.first_modulation(seen, model)
+    floor = np.full(model.channels, 0.03, np.float32)
+    tables = hmm.transitions(model.stripes)
+    gap = hmm.gaps(peaks.start, peaks.y, found.pitch)
+    top = np.maximum(model.ratio.max(axis=0), 1e-3)
+    stray_log = float(-np.log(1.5 * top).sum())
+    votes = np.zeros((len(peaks), model.stripes), np.float32)
+    posterior = votes
+    for _ in range(ROUNDS):
+        with clock.stage("emissions"):
+            evidence = emissions.log_likelihood(seen, model, modulation, floor)
+        with clock.stage("columns' model"):
+            posterior, _stray = hmm.smooth_columns(evidence + votes, peaks.start, gap, tables, stray_log)
+        with clock.stage("votes"):
+            logs = np.log(np.maximum(posterior, POSTERIOR_FLOOR))
+            votes = linking.votes_along(logs, chains, size / (2 * stripes.STEP), VOTE_GAIN)
+            modulation, floor = emissions.refined_modulation(seen, model, posterior, modulation)
+    with clock.stage("columns' model"):
+        path = hmm.best_paths(evidence + votes, peaks.start, gap, tables, stray_log)
+    with clock.stage("votes"):
+        along = linking.path_along(logs, chains, SWITCH_COST)
+    confidence = np.where(path >= 0, posterior[np.arange(len(path)), np.maximum(path, 0)], 0).astype(np.float32)
+    long_enough = np.repeat(chains.lengths * stripes.STEP >= MIN_CHAIN_PX, chains.lengths)
+    in_long = np.zeros(len(peaks), bool)
+    in_long[chains.order] = long_enough
+    label = np.where((path == along) & (confidence >= DECIDED) & in_long, path, -1).astype(np.int32)
+    agrees = emissions.agreement(seen, evidence, model, modulation, path, (peaks.start, gap))
+    with clock.stage("sub-pixel"):
+        fine = subpixel.refine(found.reduced, peaks, chains, label, found.pitch)
+    figures = {
+        "pitch_px": round(found.pitch, 3),
+        "pitch_match": round(found.match, 3),
+        "noise_dn": round(found.noise, 3),
+        "carrier_scale": round(search.scale, 5),
+        "carrier_contrast": [round(c, 2) for c in search.contrast],
+        "modulation": [round(float(m), 3) for m in modulation],
+        "noise_floor": [round(float(f), 4) for f in floor],
+        "window_px": size,
+        "agreement": {key: round(value, 4) for key, value in asdict(agrees).items()},
+        "peaks": len(peaks),
+        "peaks_decided": int((label >= 0).sum()),
+        "thresholds": {"decided": DECIDED, "min_chain_px": MIN_CHAIN_PX, "height_share": stripes.HEIGHT_FLOOR},
+    }
+    return _Decision(label, confidence, np.maximum(seen.light, 0), fine, agrees, figures)
+
+
+# --- maps ---------------------------------------------------------------------------------------------------------
+
+
+def _maps(image: Image, found: _Found, decided: _Decision, model: PatternModel, clock: _Stages) -> Decoded:
+    peaks, chains = found.peaks, found.chains
+    assert peaks is not None  # noqa: S101
+    assert chains is not None  # noqa: S101
+    keep = (decided.label >= 0) & (decided.fine.whole > 0) & (peaks.clear > 0)
+    label = np.where(keep, decided.label, -1).astype(np.int32)
+    row = ((label + 0.5) * model.pitch - 0.5).astype(np.float32)
+    counts = np.bincount(chains.column[keep], minlength=len(peaks.start) - 1)
+    slope = model.pitch / found.pitch
+    knots = dense.Knots(
+        np.concatenate(([0], np.cumsum(counts))).astype(np.int32),
+        decided.fine.y[keep],
+        row[keep],
+        (decided.fine.sigma[keep] * slope).astype(np.float32),
+        decided.confidence[keep],
+        decided.light[keep],
+        peaks.height[keep],
+        label[keep],
+    )
+    with clock.stage("dense rows"):
+        maps = dense.interpolate(knots, (image.shape[0], image.shape[1]), found.pitch, model.pitch)
+        marked = dense.stripe_map(decided.fine.y, label, chains, (image.shape[0], image.shape[1]))
+    with clock.stage("reasons"):
+        reason = _reasons(found, decided, maps.rows)
+    x = chains.column[keep] * float(stripes.STEP) + 1.5
+    peak_table = np.stack([x, knots.y, knots.row, knots.stripe, knots.confidence], axis=1).astype(np.float32)
+    warnings = []
+    if not len(peak_table):
+        warnings.append("no stripe could be decided: carriers are there, but too weak or too short")
+    figures = {
+        **decided.figures,
+        "peaks_kept": len(peak_table),
+        "stages_ms": {k: round(v, 2) for k, v in clock.ms.items()},
+    }
+    return Decoded(
+        rows=maps.rows,
+        columns=None,
+        sigma_rows=maps.sigma,
+        sigma_columns=None,
+        confidence=maps.confidence,
+        albedo=maps.albedo,
+        modulation=maps.modulation,
+        reason=reason,
+        stripes=marked,
+        peaks=peak_table,
+        warnings=tuple(warnings),
+        details=figures,
+    )
+
+
+def _upside_down(decoded: Decoded) -> Decoded:
+    """Turn maps back that were decoded from an image upside down."""
+    peaks = decoded.peaks
+    if peaks is not None:
+        peaks[:, 1] = decoded.confidence.shape[0] - 1 - peaks[:, 1]
+    return _with_maps(decoded, lambda array: array[::-1], details={**decoded.details, "upside_down": True})
+
+
+def _turned(decoded: Decoded) -> Decoded:
+    """Rows of the turned image are columns of the image."""
+    peaks = decoded.peaks
+    if peaks is not None:
+        peaks[:, :2] = peaks[:, 1::-1]
+    upright = _with_maps(decoded, lambda array: array.T)
+    return replace(upright, rows=None, sigma_rows=None, columns=upright.rows, sigma_columns=upright.sigma_rows)
+
+
+def _with_maps(decoded: Decoded, change: Callable[[NDArray[Any]], NDArray[Any]], **more: Any) -> Decoded:
+    """`decoded` with every map changed, contiguous."""
+    names = ("rows", "sigma_rows", "confidence", "albedo", "modulation", "reason", "stripes")
+    changed: dict[str, Any] = {name: np.ascontiguousarray(change(getattr(decoded, name))) for name in names}
+    return replace(decoded, **changed, **more)
+
+
+def _reasons(found: _Found, decided: _Decision, rows: Array) -> NDArray[np.uint8]:
+    """Why a pixel has no row: decided per column of four pixels by the nearest peak, (H, W) uint8."""
+    peaks, chains, signals = found.peaks, found.chains, found.signals
+    assert peaks is not None  # noqa: S101
+    assert chains is not None  # noqa: S101
+    assert signals is not None  # noqa: S101
+    why = np.full(len(peaks), np.uint8(Reason.BORDER))
+    why[decided.label < 0] = Reason.UNWRAP_RISK
+    why[signals.clipped > 0.5] = Reason.CLIPPED
+    small = np.zeros((found.reduced.shape[1], found.reduced.shape[0]), np.uint8)
+    # Without a peak: dark is shadow, bright is too little modulation.
+    half_lit = np.median(peaks.valley) + 0.5 * np.median(peaks.height)
+    small[:] = np.where(half_lit < found.reduced.T, Reason.LOW_MODULATION, Reason.SHADOW)
+    reach = int(0.6 * found.pitch)
+    y = np.rint(peaks.y).astype(np.intp)
+    for offset in range(-reach, reach + 1):
+        at = np.clip(y + offset, 0, small.shape[0] - 1)
+        small[at, chains.column] = why
+    reason = np.repeat(small, stripes.STEP, axis=1)
+    if reason.shape[1] < rows.shape[1]:
+        reason = np.pad(reason, ((0, 0), (0, rows.shape[1] - reason.shape[1])), mode="edge")
+    reason[np.isfinite(rows)] = Reason.VALUE
+    return reason

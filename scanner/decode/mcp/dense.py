@@ -1,0 +1,256 @@
+"""Dense rows between the stripes, and all maps on the camera's pixels.
+
+Within a column, rows are interpolated between consecutive decoded stripes, never across one that is missing: a cubic
+that keeps the order of its knots (Fritsch and Carlson 1980), straight where the pitch changes abruptly, as it does at
+steps. Beyond the last stripe of a run half a stripe is added, no further than its own flank reaches. Between columns
+(four pixels apart) rows are interpolated linearly where both sides agree to a third of a stripe.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode.mcp.linking import Chains
+from scanner.kernel import kernel
+
+Array = NDArray[np.float32]
+Ints = NDArray[np.int32]
+
+STEP_RATIO = 1.5
+"""Neighbouring intervals that differ by more are a step of depth, not a curved surface: a straight line then."""
+
+MARGIN = 0.42
+"""Pitches added beyond the last stripe of a run: the part of its flank that the fit has seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class Knots:
+    """Decoded peaks, column by column: start (B + 1,) int32; y, row, sigma (rows), confidence, light, height float32;
+    stripe int32.
+    """
+
+    start: Ints
+    y: Array
+    row: Array
+    sigma: Array
+    confidence: Array
+    light: Array
+    height: Array
+    stripe: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Maps:
+    """(H, W) float32 each."""
+
+    rows: Array
+    sigma: Array
+    confidence: Array
+    albedo: Array
+    modulation: Array
+
+
+def interpolate(knots: Knots, shape: tuple[int, int], pitch: float, step: float) -> Maps:
+    """Maps from decoded peaks.
+
+    Args:
+        knots: the decoded peaks.
+        shape: (H, W) of the image.
+        pitch: mean pitch, image px.
+        step: height of a stripe, projector px.
+    """
+    columns = len(knots.start) - 1
+    narrow = np.full((5, columns, shape[0]), np.nan, np.float32)
+    _columns(
+        knots.start,
+        knots.y,
+        knots.row,
+        knots.stripe,
+        np.stack([knots.sigma, knots.confidence, knots.light, knots.height], axis=1).astype(np.float32),
+        np.float32(pitch),
+        narrow,
+    )
+    wide = np.empty((5, *shape), np.float32)
+    _widen(narrow, np.float32(step / 3), wide)
+    return Maps(*wide)
+
+
+@kernel
+def _columns(start: Ints, y: Array, row: Array, stripe: Ints, others: Array, pitch: np.float32, narrow: Array) -> None:
+    size = narrow.shape[2]
+    longest = 1
+    for b in range(len(start) - 1):
+        longest = max(longest, start[b + 1] - start[b])
+    tangent = np.empty(longest, np.float32)
+    for b in range(len(start) - 1):
+        k = start[b]
+        while k < start[b + 1]:
+            last = k
+            while (
+                last + 1 < start[b + 1]
+                and stripe[last + 1] == stripe[last] + 1
+                and y[last + 1] - y[last] > np.float32(0.25) * pitch
+                and y[last + 1] - y[last] < np.float32(2.5) * pitch
+            ):
+                last += 1
+            _tangents(y, row, k, last, tangent)
+            if last > k:
+                _ends(b, y, row, others, k, last, tangent, size, narrow)
+            for j in range(k, last):
+                _between(b, y, row, others, j, tangent[j - k], tangent[j - k + 1], size, narrow)
+            k = last + 1
+
+
+@kernel
+def _tangents(y: Array, row: Array, first: int, last: int, tangent: Array) -> None:
+    """Slopes at the knots first .. last: harmonic means; the neighbour's own at steps and ends."""
+    for j in range(first, last + 1):
+        t = np.float32(0)
+        if last > first:
+            after = (row[min(j, last - 1) + 1] - row[min(j, last - 1)]) / (
+                y[min(j, last - 1) + 1] - y[min(j, last - 1)]
+            )
+            i = max(j, first + 1)
+            before = (row[i] - row[i - 1]) / (y[i] - y[i - 1])
+            wa, wb = y[min(j + 1, last)] - y[j], y[j] - y[max(j - 1, first)]
+            if j == first:
+                t = after
+                if last > first + 1:  # parabola through three knots
+                    second = (row[j + 2] - row[j + 1]) / (y[j + 2] - y[j + 1])
+                    w = (y[j + 1] - y[j]) / (y[j + 2] - y[j])
+                    if max(after, second) < np.float32(STEP_RATIO) * min(after, second):
+                        t = after + (after - second) * w
+            elif j == last:
+                t = before
+                if last > first + 1:
+                    second = (row[j - 1] - row[j - 2]) / (y[j - 1] - y[j - 2])
+                    w = (y[j] - y[j - 1]) / (y[j] - y[j - 2])
+                    if max(before, second) < np.float32(STEP_RATIO) * min(before, second):
+                        t = before + (before - second) * w
+            else:
+                # Parabola's slope, which keeps order while neighbours differ by less than STEP_RATIO.
+                t = (before * wa + after * wb) / (wa + wb)
+                if max(before, after) > np.float32(STEP_RATIO) * min(before, after):
+                    t = -np.float32(1)  # a step: each side keeps its own slope
+        tangent[j - first] = t
+
+
+@kernel
+def _between(
+    b: int, y: Array, row: Array, others: Array, j: int, left: np.float32, right: np.float32, size: int, narrow: Array
+) -> None:
+    gap = y[j + 1] - y[j]
+    rise = row[j + 1] - row[j]
+    slope = rise / gap
+    if left < 0 or right < 0:
+        left = right = slope
+    a = max(int(np.ceil(y[j])), 0)
+    for q in range(a, min(int(np.floor(y[j + 1])), size - 1) + 1):
+        t = (q - y[j]) / gap
+        u = np.float32(1) - t
+        # Hermite, written as the line plus what the tangents add.
+        bend = t * u * (u * (left - slope) - t * (right - slope)) * gap
+        narrow[0, b, q] = row[j] + rise * t + bend
+        narrow[1, b, q] = u * others[j, 0] + t * others[j + 1, 0]
+        narrow[2, b, q] = min(others[j, 1], others[j + 1, 1])
+        narrow[3, b, q] = u * others[j, 2] + t * others[j + 1, 2]
+        narrow[4, b, q] = u * others[j, 3] + t * others[j + 1, 3]
+
+
+@kernel
+def _ends(
+    b: int, y: Array, row: Array, others: Array, first: int, last: int, tangent: Array, size: int, narrow: Array
+) -> None:
+    reach = np.float32(MARGIN) * (y[first + 1] - y[first])
+    slope = tangent[0] if tangent[0] > 0 else (row[first + 1] - row[first]) / (y[first + 1] - y[first])
+    for q in range(max(int(np.ceil(y[first] - reach)), 0), min(int(np.ceil(y[first])), size)):
+        narrow[0, b, q] = row[first] + slope * (q - y[first])
+        _copy(b, q, others, first, narrow)
+    reach = np.float32(MARGIN) * (y[last] - y[last - 1])
+    t = tangent[last - first]
+    slope = t if t > 0 else (row[last] - row[last - 1]) / (y[last] - y[last - 1])
+    for q in range(max(int(np.floor(y[last])) + 1, 0), min(int(np.floor(y[last] + reach)) + 1, size)):
+        narrow[0, b, q] = row[last] + slope * (q - y[last])
+        _copy(b, q, others, last, narrow)
+
+
+@kernel
+def _copy(b: int, q: int, others: Array, k: int, narrow: Array) -> None:
+    # Two thirds as sure and twice as uncertain: extrapolated.
+    narrow[1, b, q] = 2 * others[k, 0]
+    narrow[2, b, q] = np.float32(0.67) * others[k, 1]
+    narrow[3, b, q] = others[k, 2]
+    narrow[4, b, q] = others[k, 3]
+
+
+@kernel
+def _widen(narrow: Array, agree: np.float32, wide: Array) -> None:
+    """Columns four pixels apart (x = 4 b + 1.5) to all pixels, turned upright."""
+    columns, size = narrow.shape[1], narrow.shape[2]
+    width = wide.shape[2]
+    nan = np.float32(np.nan)
+    block = 16
+    for y0 in range(0, size, block):
+        y1 = min(y0 + block, size)
+        for x in range(width):
+            position = np.float32(x - 1.5) * np.float32(0.25)
+            b = int(np.floor(position))
+            t = position - np.float32(b)
+            a, c = max(b, 0), min(max(b + 1, 0), columns - 1)
+            a = min(a, columns - 1)
+            for y in range(y0, y1):
+                left, right = narrow[0, a, y], narrow[0, c, y]
+                if abs(right - left) < agree:  # false where either is NaN
+                    wide[0, y, x] = left + (right - left) * t
+                    for m in range(1, 5):
+                        wide[m, y, x] = narrow[m, a, y] + (narrow[m, c, y] - narrow[m, a, y]) * t
+                    continue
+                pick = a if t < np.float32(0.5) else c
+                if np.isnan(narrow[0, pick, y]):
+                    wide[0, y, x] = nan
+                    wide[1, y, x] = nan
+                    wide[2, y, x] = 0
+                    wide[3, y, x] = nan
+                    wide[4, y, x] = nan
+                else:
+                    for m in range(5):
+                        wide[m, y, x] = narrow[m, pick, y]
+
+
+def stripe_map(y: Array, stripe: Ints, chains: Chains, shape: tuple[int, int]) -> NDArray[np.int16]:
+    """Index of the decoded stripe at the pixel nearest to its peak, -1 elsewhere: (H, W) int16.
+
+    Args:
+        y: (P,) float32, sub-pixel peaks.
+        stripe: (P,) int32, -1 where undecided.
+        chains: their chains: between two columns the peak lies on the line that joins them.
+        shape: (H, W).
+    """
+    result = np.full(shape, -1, np.int16)
+    _mark(y, stripe, chains.order, chains.start, chains.column, result)
+    return result
+
+
+@kernel
+def _mark(y: Array, stripe: Ints, order: Ints, start: Ints, column: Ints, result: NDArray[np.int16]) -> None:
+    height, width = result.shape
+    for c in range(len(start) - 1):
+        for p in range(start[c], start[c + 1]):
+            k = order[p]
+            if stripe[k] < 0:
+                continue
+            before = order[max(p - 1, start[c])]
+            after = order[min(p + 1, start[c + 1] - 1)]
+            extra = width - 4 * column[k] if width - 4 * column[k] < 8 else 4  # the last column takes what is left over
+            for j in range(extra):
+                other = before if j < 2 else after
+                t = abs(np.float32(j) - np.float32(1.5)) * np.float32(0.25)
+                line = y[k]
+                if stripe[other] == stripe[k]:
+                    line += (y[other] - y[k]) * min(t, np.float32(1))
+                row = int(np.floor(line + np.float32(0.5)))
+                if 0 <= row < height:
+                    result[row, 4 * column[k] + j] = stripe[k]

@@ -1,0 +1,243 @@
+"""One hidden Markov model over both kinds of stripe, for each column (Casey 2011, 5.2 and 5.3, made soft).
+
+States are the stripes in projector order. From one peak to the next the stripe grows, by one where nothing is
+missing, by more where stripes are hidden, at a cost that is bounded however many they are (a cap on the jump forced
+whole ears of a bust into wrong stripes); a jump backwards, behind a thin object in front, costs more. A peak may also
+be no stripe at all: the chain then stays in its state (the dissertation's error states e_0 .. e_n).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.kernel import kernel
+
+Array = NDArray[np.float32]
+Ints = NDArray[np.int32]
+
+MISS = 0.12
+"""Probability ratio of one more missing stripe to none."""
+
+JUMP = 2e-4
+"""Probability of any one jump forwards, however long: what bounds the cost of a step of depth."""
+
+BACK = 2e-6
+"""Probability of any one jump backwards."""
+
+STRAY = 0.01
+"""Probability that a peak is no stripe."""
+
+MAX_GAP = 6
+"""Largest number of pitches between neighbouring peaks that is told apart; beyond it jumps cost their bound."""
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Result per peak: posterior (P, S) float32, probabilities that sum to 1 - `stray`; path (P,) int32, the best
+    path's stripe or -1 for a stray peak; stray (P,) float32.
+    """
+
+    posterior: Array
+    path: Ints
+    stray: Array
+
+
+def transitions(stripes: int) -> Array:
+    """(MAX_GAP, S, S) float32: probability from stripe [1] to stripe [2] over a gap of g + 1 pitches."""
+    step = np.arange(stripes)[None, :] - np.arange(stripes)[:, None]
+    tables = []
+    for gap in range(1, MAX_GAP + 1):
+        regular = MISS ** np.abs(step - gap) * (1 - MISS)
+        table = np.where(step > 0, np.maximum(regular, JUMP), BACK)
+        tables.append(np.where(step == 0, BACK, table))
+    return np.ascontiguousarray(tables, np.float32)
+
+
+def gaps(start: Ints, y: Array, pitch: float) -> Ints:
+    """(P,) int32: pitches from the peak before to this one, 1 .. MAX_GAP; 1 for a column's first."""
+    distance = np.diff(y, prepend=np.float32(0))
+    result: Ints = np.clip(np.floor(distance / pitch + 0.35), 1, MAX_GAP).astype(np.int32)
+    firsts = start[:-1][start[:-1] < len(y)]
+    result[firsts] = 1
+    return result
+
+
+def smooth_columns(evidence: Array, start: Ints, gap: Ints, tables: Array, stray_log: float) -> tuple[Array, Array]:
+    """Forward-backward over each column.
+
+    Args:
+        evidence: (P, S) float32, log-likelihoods and votes.
+        start: (B + 1,) int32, where columns begin.
+        gap: (P,) int32, pitches to the peak before.
+        tables: of `transitions`.
+        stray_log: log-likelihood of what is seen at a peak that is no stripe.
+
+    Returns:
+        posterior (P, S) float32 and the probability of a stray peak (P,) float32.
+    """
+    posterior = np.zeros_like(evidence)
+    stray = np.zeros(len(evidence), np.float32)
+    turned = np.ascontiguousarray(tables.transpose(0, 2, 1))
+    _forward_backward(evidence, start, gap, tables, turned, np.float32(stray_log), posterior, stray)
+    return posterior, stray
+
+
+NEGLIGIBLE = np.float32(1e-6)
+"""Shares of a distribution below which a state is passed over: far under what JUMP gives every other state."""
+
+
+@kernel
+def _move(source: Array, table: Array, target: Array) -> None:
+    """target = source @ table, without the sources that hardly matter."""
+    states = len(source)
+    target[:] = 0
+    top = np.float32(0)
+    for p in range(states):
+        top = max(top, source[p])
+    for p in range(states):
+        a = source[p]
+        if a > NEGLIGIBLE * top:
+            row = table[p]
+            for s in range(states):
+                target[s] += a * row[s]
+
+
+@kernel
+def _normalise(values: Array) -> None:
+    total = np.float32(0)
+    for s in range(len(values)):
+        total += values[s]
+    scale = np.float32(1) / max(total, np.float32(1e-30))
+    for s in range(len(values)):
+        values[s] *= scale
+
+
+@kernel
+def _likelihoods(evidence: Array, stray_log: np.float32, likely: Array) -> np.float32:
+    """Likelihoods from logarithms, the largest at 1 - STRAY; returns that of a stray peak."""
+    top = stray_log
+    for s in range(len(evidence)):
+        top = max(top, evidence[s])
+    for s in range(len(evidence)):
+        likely[s] = np.float32(1 - STRAY) * np.exp(evidence[s] - top)
+    lost: np.float32 = np.float32(STRAY) * np.exp(stray_log - top)
+    return lost
+
+
+@kernel
+def _longest(start: Ints) -> int:
+    longest = 0
+    for b in range(len(start) - 1):
+        longest = max(longest, start[b + 1] - start[b])
+    return longest
+
+
+@kernel
+def _forward_backward(
+    evidence: Array,
+    start: Ints,
+    gap: Ints,
+    tables: Array,
+    turned: Array,
+    stray_log: np.float32,
+    posterior: Array,
+    stray: Array,
+) -> None:
+    states = evidence.shape[1]
+    longest = _longest(start)
+    alpha = np.empty((longest + 1, states), np.float32)
+    moved = np.empty((longest, states), np.float32)
+    likely = np.empty((longest, states), np.float32)
+    lost = np.empty(longest, np.float32)
+    beta = np.empty(states, np.float32)
+    product = np.empty(states, np.float32)
+    before = np.empty(states, np.float32)
+    for b in range(len(start) - 1):
+        first, size = start[b], start[b + 1] - start[b]
+        alpha[0, :] = np.float32(1) / np.float32(states)
+        for t in range(size):
+            lost[t] = _likelihoods(evidence[first + t], stray_log, likely[t])
+            if t == 0:
+                moved[0, :] = alpha[0]
+            else:
+                _move(alpha[t], tables[gap[first + t] - 1], moved[t])
+            for s in range(states):
+                # The state of a stray peak is that of the peak before it.
+                alpha[t + 1, s] = moved[t, s] * likely[t, s] + alpha[t, s] * lost[t]
+            _normalise(alpha[t + 1])
+        beta[:] = 1
+        for t in range(size - 1, -1, -1):
+            bad, good = np.float32(0), np.float32(0)
+            for s in range(states):
+                product[s] = likely[t, s] * beta[s]
+                posterior[first + t, s] = moved[t, s] * product[s]
+                good += posterior[first + t, s]
+                bad += alpha[t, s] * lost[t] * beta[s]
+            scale = np.float32(1) / max(good + bad, np.float32(1e-30))
+            for s in range(states):
+                posterior[first + t, s] *= scale
+            stray[first + t] = bad * scale
+            if t > 0:
+                _move(product, turned[gap[first + t] - 1], before)
+                for s in range(states):
+                    beta[s] = before[s] + beta[s] * lost[t]
+                _normalise(beta)
+
+
+def best_paths(evidence: Array, start: Ints, gap: Ints, tables: Array, stray_log: float) -> Ints:
+    """Viterbi (1967) over each column: (P,) int32, the stripe, or -1 where the best path takes the peak for stray.
+
+    Arguments as for `smooth_columns`.
+    """
+    path = np.full(len(evidence), -1, np.int32)
+    _viterbi(evidence, start, gap, np.log(tables), np.float32(stray_log), path)
+    return path
+
+
+@kernel
+def _best_sources(score: Array, table: Array, best: Array, source: Ints) -> None:
+    states = len(score)
+    best[:] = -np.float32(1e30)
+    for p in range(states):
+        row = table[p]
+        from_here = score[p]
+        for s in range(states):
+            value = from_here + row[s]
+            if value > best[s]:
+                best[s] = value
+                source[s] = p
+
+
+@kernel
+def _viterbi(evidence: Array, start: Ints, gap: Ints, logs: Array, stray_log: np.float32, path: Ints) -> None:
+    states = evidence.shape[1]
+    longest = _longest(start)
+    came = np.empty((longest, states), np.int32)
+    real = np.empty((longest, states), np.bool_)
+    score = np.empty(states, np.float32)
+    best = np.empty(states, np.float32)
+    source = np.empty(states, np.int32)
+    keep, lose = np.float32(np.log(1 - STRAY)), np.float32(np.log(STRAY)) + stray_log
+    for b in range(len(start) - 1):
+        first, size = start[b], start[b + 1] - start[b]
+        score[:] = 0
+        for t in range(size):
+            if t == 0:
+                best[:] = 0
+                source[:] = np.arange(states)
+            else:
+                _best_sources(score, logs[gap[first + t] - 1], best, source)
+            for s in range(states):
+                taken = best[s] + keep + evidence[first + t, s]
+                passed = score[s] + lose
+                real[t, s] = taken >= passed
+                came[t, s] = source[s] if taken >= passed else s
+                score[s] = max(taken, passed)
+        s = int(np.argmax(score))
+        for t in range(size - 1, -1, -1):
+            if real[t, s]:
+                path[first + t] = s
+            s = came[t, s]

@@ -1,0 +1,192 @@
+"""Stripes followed from column to column, and evidence passed along them.
+
+A chain is a run of peaks in neighbouring columns that lie on one smooth line; it ends at bends, jumps of
+brightness, and where no peak follows. A chain is no claim that its peaks are one stripe: at a step of depth of a
+whole pitch stripes line up again, which the switching cost of `path_along` allows for.
+The dissertation grows regions instead (Casey 2011, 5.4), which crosses depth edges.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode.mcp.stripes import Peaks
+from scanner.kernel import kernel
+
+Array = NDArray[np.float32]
+Ints = NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """order: (P,) int32, peaks chain by chain, left to right. start: (C + 1,) int32, where chains begin in `order`.
+    column: (P,) int32, the column of each peak (in the order of `Peaks`).
+    """
+
+    order: Ints
+    start: Ints
+    column: Ints
+
+    @property
+    def lengths(self) -> Ints:
+        """(C,) int32: peaks of each chain."""
+        return np.diff(self.start)
+
+
+def link(peaks: Peaks, pitch: float) -> Chains:
+    """Chain the peaks of neighbouring columns: mutual nearest, on a smooth line, of like height.
+
+    Limits in shares of the pitch: 0.3 between columns (two stripes are 1 apart), 0.12 off the line so far
+    (0.5 is the next valley; the profile's flank must stay in the fit window).
+    """
+    column = np.repeat(np.arange(len(peaks.start) - 1, dtype=np.int32), np.diff(peaks.start))
+    order, start = _link(peaks.start, peaks.y, peaks.height, np.float32(0.3 * pitch), np.float32(0.12 * pitch))
+    return Chains(order, start, column)
+
+
+@kernel
+def _nearest(y: Array, first: int, last: int, target: np.float32) -> int:
+    best, distance = -1, np.float32(1e9)
+    for k in range(first, last):
+        d = abs(y[k] - target)
+        if d < distance:
+            best, distance = k, d
+    return best
+
+
+@kernel
+def _link(start: Ints, y: Array, height: Array, reach: np.float32, bend: np.float32) -> tuple[Ints, Ints]:
+    count = len(y)
+    after = np.full(count, -1, np.int32)
+    before = np.full(count, -1, np.int32)
+    slope = np.zeros(count, np.float32)
+    third = np.float32(1 / 3)
+    for b in range(len(start) - 2):
+        j = start[b + 1]
+        for i in range(start[b], start[b + 1]):
+            target = y[i] + slope[i]
+            while j < start[b + 2] and y[j] < target - reach:
+                j += 1
+            k = _nearest(y, j, min(j + 3, start[b + 2]), target)
+            if k < 0 or abs(y[k] - y[i]) > reach or abs(y[k] - target) > bend:
+                continue
+            if height[k] < third * height[i] or height[i] < third * height[k]:
+                continue
+            if before[k] >= 0:  # two claim it: the nearer keeps it
+                other = before[k]
+                if abs(y[other] + slope[other] - y[k]) <= abs(y[k] - target):
+                    continue
+                after[other] = -1
+            after[i] = k
+            before[k] = i
+            slope[k] = np.float32(0.7) * slope[i] + np.float32(0.3) * (y[k] - y[i])
+    order = np.empty(count, np.int32)
+    chains = np.empty(count + 1, np.int32)
+    n, c = 0, 0
+    for i in range(count):
+        if before[i] >= 0:
+            continue
+        chains[c] = n
+        c += 1
+        k = i
+        while k >= 0:
+            order[n] = k
+            n += 1
+            k = after[k]
+    chains[c] = n
+    return order, chains[: c + 1].copy()
+
+
+def votes_along(log_posterior: Array, chains: Chains, reach: float, gain: float) -> Array:
+    """What a peak's neighbours on its chain think it is.
+
+    Args:
+        log_posterior: (P, S) float32, natural logarithms, floored by the caller.
+        chains: the chains.
+        reach: columns over which a vote falls to 1 / e.
+        gain: worth of the mean vote, in votes.
+
+    Returns:
+        (P, S) float32: gain times the weighted mean of the neighbours' logarithms; 0 for a peak alone.
+    """
+    votes = np.zeros_like(log_posterior)
+    _votes(log_posterior, chains.order, chains.start, np.float32(np.exp(-1 / reach)), np.float32(gain), votes)
+    return votes
+
+
+@kernel
+def _votes(logs: Array, order: Ints, start: Ints, decay: np.float32, gain: np.float32, votes: Array) -> None:
+    states = logs.shape[1]
+    weight = np.zeros(len(order), np.float32)
+    total = np.empty(states, np.float32)
+    one = np.float32(1)
+    for c in range(len(start) - 1):
+        for way in range(2):
+            total[:] = 0
+            mass = np.float32(0)
+            for step in range(start[c + 1] - start[c]):
+                k = order[start[c] + step] if way == 0 else order[start[c + 1] - 1 - step]
+                for s in range(states):
+                    votes[k, s] += total[s]
+                    total[s] = decay * (total[s] + logs[k, s])
+                weight[k] += mass
+                mass = decay * (mass + one)
+    for k in range(len(order)):
+        if weight[k] > 0:
+            # Few neighbours are worth less than a full vote.
+            f = gain / max(weight[k], one)
+            for s in range(states):
+                votes[k, s] *= f
+
+
+def path_along(logs: Array, chains: Chains, switch: float) -> Ints:
+    """The best stripe for each peak, chains taken one by one, with a cost for changing stripe along a chain.
+
+    Args:
+        logs: (P, S) float32 log-evidence of each peak.
+        chains: the chains.
+        switch: cost of a change, natural logarithm.
+
+    Returns:
+        (P,) int32.
+    """
+    path = np.zeros(len(logs), np.int32)
+    _path(logs, chains.order, chains.start, np.float32(switch), path)
+    return path
+
+
+@kernel
+def _path(logs: Array, order: Ints, start: Ints, switch: np.float32, path: Ints) -> None:
+    states = logs.shape[1]
+    longest = 0
+    for c in range(len(start) - 1):
+        longest = max(longest, start[c + 1] - start[c])
+    came = np.empty((longest, states), np.int32)
+    score = np.empty(states, np.float32)
+    for c in range(len(start) - 1):
+        size = start[c + 1] - start[c]
+        score[:] = 0
+        for step in range(size):
+            k = order[start[c] + step]
+            top = 0
+            for s in range(states):
+                if score[s] > score[top]:
+                    top = s
+            limit = score[top] - switch
+            for s in range(states):
+                if score[s] >= limit:
+                    came[step, s] = s
+                else:
+                    came[step, s] = top
+                    score[s] = limit
+                score[s] += logs[k, s]
+        s = 0
+        for t in range(states):
+            if score[t] > score[s]:
+                s = t
+        for step in range(size - 1, -1, -1):
+            path[order[start[c] + step]] = s
+            s = came[step, s]

@@ -1,0 +1,236 @@
+"""Stripe finding: the pitch, and in each column of the image the stripes' peaks with their valleys (Casey 2011, 4.1).
+
+Columns are averaged by fours first: sample b stands for x = 4 b + 1.5. The dissertation binarises with a hole filter
+in two passes to learn the stripes' frequency; here the columns' mean spectrum is matched with the pattern's own on a
+logarithmic frequency axis, which also tells a stripe from a pair of them in the published pattern, whose stripes are
+bright and dim in turn.
+Not here: which stripe a peak is, and where it lies to a fraction of a pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode.mcp.model import PatternModel
+from scanner.kernel import kernel
+
+Array = NDArray[np.float32]
+Image = NDArray[Any]
+"""(H, W) uint8 or uint16"""
+
+STEP = 4
+"""Image columns averaged into one. A twelfth of the smallest object worth decoding (50 px), a quarter of the work."""
+
+MIN_PITCH_PX = 5.0
+"""Finer stripes have less than two samples on a flank once blurred by camera and projector."""
+
+MIN_STRIPES = 3.0
+"""Stripes in the image below which nothing can be decoded: a code word needs neighbours."""
+
+_LOG_STEP = 0.01
+"""Ratio between neighbours of the logarithmic frequency axis: a tenth of the spread that depth gives the pitch."""
+
+HEIGHT_FLOOR = 0.04
+"""Stripes lower than this share of the 99th percentile are left out: what lies outside the object (mcp.md, sec. 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Peaks:
+    """Stripe peaks, column by column from left to right, from top to bottom within one.
+
+    start: (B + 1,) int32, where each column's peaks begin. Of each peak (P,) float32: y px; height above the line
+    between its valleys and brightness of that line, grey levels; above, below: y of the valleys. clear: uint8,
+    0 where a flank is missing or cut by the image's border.
+    """
+
+    start: NDArray[np.int32]
+    y: Array
+    height: Array
+    valley: Array
+    above: Array
+    below: Array
+    clear: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+
+def reduce_columns(image: Image) -> Array:
+    """Average columns by fours and turn the image, so that a column is contiguous.
+
+    Args:
+        image: (H, W) uint8 or uint16.
+
+    Returns:
+        (W // 4, H) float32, grey levels. Up to three columns at the right are left out.
+    """
+    reduced = np.empty((image.shape[1] // STEP, image.shape[0]), np.float32)
+    _reduce(image, reduced)
+    return reduced
+
+
+@kernel
+def _reduce(image: Image, reduced: Array) -> None:
+    columns, rows = reduced.shape
+    block = 16  # rows written together: one cache line of the turned image
+    for y0 in range(0, rows, block):
+        y1 = min(y0 + block, rows)
+        for b in range(columns):
+            x = 4 * b
+            for y in range(y0, y1):
+                total = np.float32(image[y, x]) + np.float32(image[y, x + 1])
+                total += np.float32(image[y, x + 2]) + np.float32(image[y, x + 3])
+                reduced[b, y] = total * np.float32(0.25)
+
+
+def noise_of(reduced: Array) -> float:
+    """Noise of the averaged columns, grey levels (1 sigma).
+
+    From second differences along the column, which vanish on a triangle's flanks; the median ignores the peaks.
+    """
+    part = reduced[:: max(1, len(reduced) // 64)]
+    second = part[:, 2:] - 2 * part[:, 1:-1] + part[:, :-2]
+    return float(np.median(np.abs(second)) * 1.4826 / np.sqrt(6))
+
+
+def estimate_pitch(reduced: Array, model: PatternModel) -> tuple[float, float]:
+    """The stripes' mean pitch.
+
+    Args:
+        reduced: (B, H) float32.
+        model: the pattern's tables.
+
+    Returns:
+        pitch in image px, and the correlation (0..1) of image and pattern spectrum at it.
+    """
+    axis = np.arange(np.log(2.0 / reduced.shape[1]), np.log(0.5), _LOG_STEP)
+    seen = _log_spectrum(reduced[:: max(1, len(reduced) // 96)], axis)
+    # The pattern's own, sampled at 16 to a pitch: 1 / 16 is the stripes' frequency there.
+    centre = np.log(1 / 16)
+    own_axis = centre + np.arange(-100, 131) * _LOG_STEP
+    own = _log_spectrum(model.column[None, :], own_axis)
+    low = int(np.searchsorted(axis, np.log(MIN_STRIPES / reduced.shape[1])))
+    high = int(np.searchsorted(axis, np.log(1 / (MIN_PITCH_PX * 0.8))))
+    total = max(float(seen @ seen), 1e-12)
+    best, score = low, -1.0
+    for i in range(low, high):
+        first, last = i - 100, i + 131
+        a, b = max(first, 0), min(last, len(axis))
+        piece, mask = seen[a:b], own[a - first : len(own) - (last - b)]
+        norm = np.sqrt((piece @ piece) * (own @ own))
+        value = float(piece @ mask / norm) if norm > 0 else 0.0
+        # Sums over fewer bins near the ends are no worse evidence; energy decides between equals.
+        value *= float(np.sqrt((piece @ piece) / total)) ** 0.5
+        if value > score:
+            best, score = i, value
+    return float(1 / np.exp(axis[best])), score
+
+
+def _log_spectrum(columns: Array, axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean amplitude spectrum of `columns` on a logarithmic axis, times frequency, smoothed by 3 %."""
+    size = columns.shape[1]
+    window = np.hanning(size).astype(np.float32)
+    mean = (columns * window).sum(axis=1, keepdims=True) / window.sum()
+    length = int(2 ** np.ceil(np.log2(2 * size)))
+    amplitude = np.abs(np.fft.rfft((columns - mean) * window, length, axis=1)).mean(axis=0)
+    frequency = np.arange(len(amplitude)) / length
+    # Times frequency: scenes fall off with 1 / f, so this makes their part level.
+    on_axis = np.interp(np.exp(axis), frequency, amplitude * frequency)
+    taps = np.exp(-0.5 * (np.arange(-9, 10) / 3) ** 2)
+    return np.asarray(np.convolve(on_axis, taps / taps.sum(), mode="same"))
+
+
+def find_peaks(reduced: Array, pitch: float, carrier_px: float, noise: float) -> Peaks:
+    """Peaks of all stripes.
+
+    Args:
+        reduced: (B, H) float32.
+        pitch: mean pitch, px.
+        carrier_px: longest period of a carrier, px: columns are smoothed over it, or peaks break up at its troughs.
+        noise: 1 sigma of `reduced`, grey levels.
+    """
+    sigma_x, sigma_y = 0.3 * carrier_px / STEP, pitch / 12
+    smooth = np.asarray(
+        cv2.GaussianBlur(reduced, (0, 0), sigmaX=sigma_y, sigmaY=sigma_x, borderType=cv2.BORDER_REFLECT_101),
+        np.float32,
+    )
+    # A Gaussian of sigma a, b leaves 1 / sqrt(4 pi a b) of white noise.
+    left = noise / np.sqrt(max(1.0, 4 * np.pi * sigma_x * sigma_y))
+    table = _peaks_of(smooth, np.float32(5 * left + 1e-3), np.float32(pitch))
+    start, rows = table
+    heights = rows[:, 1]
+    if not len(heights):
+        return _as_peaks(start, rows)
+    floor = max(HEIGHT_FLOOR * float(np.percentile(heights, 99)), 8 * left)
+    keep = heights >= floor
+    counts = np.add.reduceat(np.append(keep, False).astype(np.int32), np.minimum(start[:-1], len(keep)))
+    counts[start[:-1] == start[1:]] = 0
+    return _as_peaks(np.concatenate(([0], np.cumsum(counts))).astype(np.int32), rows[keep])
+
+
+def _as_peaks(start: NDArray[np.int32], rows: Array) -> Peaks:
+    y, height, valley, above, below, clear = (np.ascontiguousarray(rows[:, k]) for k in range(6))
+    return Peaks(start, y, height, valley, above, below, clear.astype(np.uint8))
+
+
+@kernel
+def _peaks_of(smooth: Array, delta: np.float32, pitch: np.float32) -> tuple[NDArray[np.int32], Array]:
+    """Maxima and minima in turn, each `delta` away from its neighbours (hysteresis), with their figures."""
+    columns, size = smooth.shape
+    start = np.zeros(columns + 1, np.int32)
+    capacity = columns * (int(size / (0.3 * pitch)) + 4)
+    rows = np.empty((capacity, 6), np.float32)
+    tops = np.empty(size + 2, np.int32)
+    lows = np.empty(size + 2, np.int32)
+    count = 0
+    for b in range(columns):
+        line = smooth[b]
+        n = 0  # tops found; lows[k] lies before tops[k], lows[n] after the last
+        rising = True
+        low_at, top_at = 0, 0
+        for y in range(1, size):
+            value = line[y]
+            if rising:
+                if value > line[top_at]:
+                    top_at = y
+                elif value < line[top_at] - delta:
+                    if line[top_at] > line[low_at] + delta or n == 0:
+                        lows[n] = low_at
+                        tops[n] = top_at
+                        n += 1
+                    rising = False
+                    low_at = y
+            elif value < line[low_at]:
+                low_at = y
+            elif value > line[low_at] + delta:
+                rising = True
+                top_at = y
+        lows[n] = low_at
+        for k in range(n):
+            top, above, below = tops[k], lows[k], lows[k + 1]
+            if top < 1 or top > size - 2 or count >= capacity:
+                continue
+            # A valley further than a pitch away is flat ground: its near end counts.
+            above = max(above, top - int(pitch))
+            below = min(below, top + int(pitch))
+            left, right = line[top] - line[above], line[top] - line[below]
+            share = (top - above) / max(below - above, 1)
+            valley = line[above] + (line[below] - line[above]) * share
+            curve = line[top - 1] - 2 * line[top] + line[top + 1]
+            shift = np.float32(0.5) * (line[top - 1] - line[top + 1]) / curve if curve < 0 else np.float32(0)
+            reach = np.float32(0.3) * pitch
+            inside = top >= reach and top <= size - 1 - reach
+            rows[count, 0] = top + shift
+            rows[count, 1] = line[top] - valley
+            rows[count, 2] = valley
+            rows[count, 3] = above
+            rows[count, 4] = below
+            rows[count, 5] = 1.0 if inside and min(left, right) > np.float32(0.4) * max(left, right) else 0.0
+            count += 1
+        start[b + 1] = count
+    return start, rows[:count].copy()

@@ -1,0 +1,279 @@
+"""Where a stripe's peak lies, to a fraction of a pixel.
+
+The profile is straightened and averaged along the stripe, not along the image row, then split into its even and odd
+part about the first guess. The odd part is a shift (the even part's own derivative, so a triangle, a cosine, a blurred
+or a clipped top need no model: where the top is flat only the flanks speak) plus a slope of brightness; the slope is
+smoothed along the stripe and taken off only as far as it is significant. What stretch of the surface adds to the odd
+part follows from the distances to the neighbouring stripes.
+Such a figure averages some 28 x 0.8 pitch pixels: it is no more accurate than its neighbours are alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode.mcp.linking import Chains
+from scanner.decode.mcp.stripes import Peaks
+from scanner.kernel import kernel
+
+Array = NDArray[np.float32]
+Ints = NDArray[np.int32]
+
+HALF_COLUMNS = 3
+"""Columns (of four pixels) averaged to either side: 28 px in all, a carrier's period or two."""
+
+SLOPE_COLUMNS = 8
+"""Columns over which the slope of brightness is averaged to either side: shading changes slower than position."""
+
+REACH = 0.42
+"""Half the fit window in pitches: the flanks without the rounded valley."""
+
+ROUGH = np.float32(0.12)
+"""Residual of the odd part, as a share of the stripe's height, above which it is no whole stripe: a triangle cut off at
+a third of its flank leaves as much."""
+
+SIGMA_FLOOR = np.float32(0.005)
+"""Error that no residual shows: the pattern's own 8 bits, px."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fine:
+    """y: (P,) float32, sub-pixel peak. sigma: (P,) float32 its 1-sigma, px. whole: (P,) uint8, 0 where the profile is
+    no whole stripe: a flank cut off, or not symmetrical once shift and slope are taken away.
+    """
+
+    y: Array
+    sigma: Array
+    whole: NDArray[np.uint8]
+
+
+def refine(reduced: Array, peaks: Peaks, chains: Chains, label: Ints, pitch: float) -> Fine:
+    """Sub-pixel positions of the peaks that have a label.
+
+    Args:
+        reduced: (B, H) float32, columns averaged by fours.
+        peaks: P peaks.
+        chains: their chains.
+        label: (P,) int32, decoded stripe, -1 for none; averaging stops where it changes along a chain.
+        pitch: mean pitch, px.
+    """
+    runs, ends = _runs(chains.order, chains.start, label)
+    guess = _smoothed(peaks.y, runs, ends)
+    reach = max(3, int(REACH * pitch))
+    count = len(peaks)
+    y, sigma, whole = peaks.y.copy(), np.full(count, np.float32(0.5)), np.zeros(count, np.uint8)
+    _refine(
+        reduced,
+        guess,
+        peaks.above,
+        peaks.below,
+        peaks.valley,
+        peaks.height,
+        chains.column,
+        runs,
+        ends,
+        reach,
+        y,
+        sigma,
+        whole,
+    )
+    _unstretch(y, peaks.start, label, np.float32(pitch))
+    return Fine(y, sigma, whole)
+
+
+@kernel
+def _runs(order: Ints, start: Ints, label: Ints) -> tuple[Ints, Ints]:
+    """Peaks in chain order without unlabelled ones, and where runs of one label begin."""
+    kept = np.empty(len(order), np.int32)
+    ends = np.empty(len(order) + 1, np.int32)
+    n, runs = 0, 0
+    for c in range(len(start) - 1):
+        previous = -2
+        for p in range(start[c], start[c + 1]):
+            k = order[p]
+            if label[k] < 0:
+                previous = -2
+                continue
+            if label[k] != previous:
+                ends[runs] = n
+                runs += 1
+                previous = label[k]
+            kept[n] = k
+            n += 1
+    ends[runs] = n
+    return kept[:n].copy(), ends[: runs + 1].copy()
+
+
+@kernel
+def _smoothed(y: Array, runs: Ints, ends: Ints) -> Array:
+    """Local mean of y after a local line, +- HALF_COLUMNS, shrinking at the ends so that it stays symmetrical."""
+    out = y.copy()
+    for r in range(len(ends) - 1):
+        first, last = ends[r], ends[r + 1]
+        for p in range(first, last):
+            half = min(HALF_COLUMNS, p - first, last - 1 - p)
+            total = np.float32(0)
+            for q in range(p - half, p + half + 1):
+                total += y[runs[q]]
+            out[runs[p]] = total / np.float32(2 * half + 1)
+    return out
+
+
+@kernel
+def _straighten(line: Array, centre: np.float32, reach: int, profile: Array) -> None:
+    """profile[u] = line at centre + u - reach, between samples linearly."""
+    base = int(np.floor(centre))
+    f = centre - base
+    for u in range(-reach, reach + 1):
+        a = min(max(base + u, 0), len(line) - 2)
+        profile[u + reach] = line[a] + (line[a + 1] - line[a]) * f
+
+
+@kernel
+def _room(size: int, g: np.float32, above: np.float32, below: np.float32, reach: int) -> int:
+    """Samples to either side of a peak: within the image, and short of the neighbours' flanks where foreshortened."""
+    near = np.float32(0.9) * min(g - above, below - g)
+    return int(min(np.float32(reach), g - 1, size - 3 - g, near))
+
+
+@kernel
+def _products(mean: Array, reach: int, limit: int, sums: Array) -> None:
+    """Sums over the window of shift x shift, shift x slope, slope x slope, odd x shift, odd x slope, odd x odd.
+
+    The odd part of the profile `mean` is explained by a shift (the even part's derivative) and a slope of brightness
+    (the even part times the distance).
+    """
+    sums[:] = 0
+    for u in range(1, limit):
+        right, left = mean[reach + u], mean[reach - u]
+        odd = np.float32(0.5) * (right - left)
+        slope = np.float32(0.5) * (right + left) * np.float32(u)
+        inner, outer = mean[reach + u - 1] + mean[reach - u + 1], mean[reach + u + 1] + mean[reach - u - 1]
+        shift = np.float32(0.25) * (inner - outer)
+        sums[0] += shift * shift
+        sums[1] += shift * slope
+        sums[2] += slope * slope
+        sums[3] += odd * shift
+        sums[4] += odd * slope
+        sums[5] += odd * odd
+
+
+@kernel
+def _slope_at(p: int, count: int, kappa: Array, worth: Array) -> np.float32:
+    """The slope of brightness about place `p` of a run, shrunk by its own significance."""
+    slope, weight, square = np.float32(0), np.float32(0), np.float32(0)
+    lo, hi = max(p - SLOPE_COLUMNS, 0), min(p + SLOPE_COLUMNS, count - 1)
+    for q in range(lo, hi + 1):
+        slope += worth[q] * kappa[q]
+        square += worth[q] * kappa[q] * kappa[q]
+        weight += worth[q]
+    if weight <= 0:
+        return np.float32(0)
+    slope /= weight
+    # The scatter along the stripe says how sure it is; windows of 7 columns overlap.
+    scatter = max(square / weight - slope * slope, np.float32(0))
+    independent = max(np.float32(1), np.float32(hi - lo + 1) / np.float32(2 * HALF_COLUMNS + 1))
+    return slope * (slope * slope / (slope * slope + scatter / independent + np.float32(1e-12)))
+
+
+@kernel
+def _window_sums(profile: Array, ground: Array, usable: Ints, p: int, count: int, mean: Array, sums: Array) -> int:
+    """Average the profiles about place `p` of a run, and sum their products; returns the samples used to a side."""
+    reach = (profile.shape[1] - 1) // 2
+    lo, hi = max(p - HALF_COLUMNS, 0), min(p + HALF_COLUMNS, count - 1)
+    limit = int(usable[p])
+    mean[:] = 0
+    for q in range(lo, hi + 1):
+        limit = min(limit, int(usable[q]))
+        for u in range(profile.shape[1]):
+            mean[u] += profile[q, u] - ground[q]
+    for u in range(profile.shape[1]):
+        mean[u] /= np.float32(hi - lo + 1)
+    _products(mean, reach, limit, sums)
+    return limit
+
+
+@kernel
+def _longest_run(ends: Ints) -> int:
+    longest = 1
+    for r in range(len(ends) - 1):
+        longest = max(longest, ends[r + 1] - ends[r])
+    return longest
+
+
+@kernel
+def _refine(
+    reduced: Array,
+    guess: Array,
+    above: Array,
+    below: Array,
+    valley: Array,
+    height: Array,
+    column: Ints,
+    runs: Ints,
+    ends: Ints,
+    reach: int,
+    y: Array,
+    sigma: Array,
+    whole: NDArray[np.uint8],
+) -> None:
+    longest = _longest_run(ends)
+    profile = np.empty((longest, 2 * reach + 1), np.float32)
+    mean = np.empty(2 * reach + 1, np.float32)
+    ground, kappa, worth = np.empty(longest, np.float32), np.empty(longest, np.float32), np.empty(longest, np.float32)
+    usable, used = np.zeros(longest, np.int32), np.zeros(longest, np.int32)
+    sums = np.empty((longest, 6), np.float32)
+    for r in range(len(ends) - 1):
+        first, count = ends[r], ends[r + 1] - ends[r]
+        for p in range(count):
+            k = runs[first + p]
+            usable[p] = _room(reduced.shape[1], guess[k], above[k], below[k], reach)
+            ground[p] = valley[k]
+            _straighten(reduced[column[k]], guess[k], reach, profile[p])
+        for p in range(count):
+            used[p] = _window_sums(profile, ground, usable, p, count, mean, sums[p])
+            ss, sv, vv, os, ov = sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3], sums[p, 4]
+            determinant = ss * vv - sv * sv
+            apart = used[p] >= 4 and determinant > np.float32(1e-4) * ss * vv
+            kappa[p] = (ss * ov - sv * os) / determinant if apart else np.float32(0)
+            worth[p] = determinant / ss if apart else np.float32(0)
+        for p in range(count):
+            ss, sv, vv, os, ov, oo = sums[p]
+            if used[p] < 3 or ss <= 0:
+                continue
+            k = runs[first + p]
+            slope = _slope_at(p, count, kappa, worth)
+            shift = (os - slope * sv) / ss
+            left = (
+                oo - 2 * shift * os - 2 * slope * ov + shift * shift * ss + 2 * shift * slope * sv + slope * slope * vv
+            )
+            rough = np.sqrt(max(left, np.float32(0)) / np.float32(max(used[p] - 2, 1)))
+            sigma[k] = rough / np.sqrt(ss) + SIGMA_FLOOR
+            y[k] = guess[k] + shift
+            far = abs(shift) > np.float32(0.35) * np.float32(reach)
+            whole[k] = 0 if far or rough > ROUGH * height[k] else 1
+
+
+@kernel
+def _unstretch(y: Array, start: Ints, label: Ints, pitch: np.float32) -> None:
+    """Take off what a change of the local pitch adds to the odd part: the second difference of the neighbours.
+
+    With u = a t + c t^2 (t in pitches, u in px) the flanks at t^2 = m lie c m off; m is the mean of t^2 over the fit
+    window, REACH^2 / 3.
+    """
+    moved = np.zeros(len(y), np.float32)
+    m = np.float32(REACH * REACH / 3)
+    for b in range(len(start) - 1):
+        for k in range(start[b] + 1, start[b + 1] - 1):
+            s = label[k]
+            if s < 0 or label[k - 1] != s - 1 or label[k + 1] != s + 1:
+                continue
+            before, after = y[k] - y[k - 1], y[k + 1] - y[k]
+            # A step of depth is no stretch: its second difference is not small beside the pitch.
+            if abs(after - before) < np.float32(0.15) * pitch:
+                moved[k] = np.float32(0.5) * (after - before) * m
+    for k in range(len(y)):
+        y[k] -= moved[k]
