@@ -1,0 +1,1 @@
+"""The commands of `fringed`, one subject a module. Each returns its exit status and raises ScannerError."""

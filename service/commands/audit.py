@@ -1,0 +1,71 @@
+"""`fringed audit`: verifies from a capture's folder alone which frame saw which pattern, and draws the timing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.commands.options import AsJson, Force
+from service.terminal import print_error, print_facts, print_json, print_table, progress_lines
+
+if TYPE_CHECKING:
+    from scanner.sequencer import CaptureCheck
+
+
+def audit(
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture folder, or its JSON file.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Draw the timing diagram: .svg or .png.")
+    ] = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> int:
+    """Verify a capture again: stamps and content of every frame against the plan.
+
+    Exit status 1 if anything speaks against a frame; the message names it.
+
+    \b
+    Examples:
+      fringed audit scan/capture
+      fringed audit scan/capture -o timing.svg
+    """
+    if output is not None and output.suffix not in (".svg", ".png"):
+        raise typer.BadParameter(f"-o: expected a name that ends in .svg or .png, got {str(output)!r}")
+    if output is not None and output.exists() and not force:
+        raise typer.BadParameter(f"-o: {output} exists; --force replaces it")
+    with progress_lines() as lines:
+        lines.stage("reading frames")
+        from scanner.capture import Capture  # noqa: PLC0415
+        from scanner.sequencer import check_capture, timing_diagram  # noqa: PLC0415
+        from scanner.storage import replace_file  # noqa: PLC0415
+
+        check = check_capture(Capture.open(capture))
+        if output is not None:
+            lines.stage("drawing")
+            replace_file(output, timing_diagram(check, output.suffix.removeprefix(".")))
+    if as_json:
+        print_json({"capture": str(capture), "diagram": output and str(output), **check.as_dict()})
+    else:
+        _show(check, output)
+    if not check.passed:
+        suspects = ", ".join(map(str, check.suspects)) or "none in particular"
+        print_error(f"frames and patterns are out of step; frames concerned: {suspects}")
+    return 0 if check.passed else 1
+
+
+def _show(check: CaptureCheck, diagram: Path | None) -> None:
+    sequence = check.capture.header.sequence
+    count = len(sequence)
+    print_table(
+        "frames",
+        ("pattern", "shows", "verdict", "reasons"),
+        ((v.pattern, sequence.role(v.pattern % count).value, v.verdict, "; ".join(v.reasons)) for v in check.verdicts),
+    )
+    facts = [("frames", f"{len(check.capture.records)} of {check.capture.header.frame_count}")]
+    facts += [(str(verdict), str(number)) for verdict, number in check.summary().items()]
+    facts += [("cannot reveal", text) for text in check.witnesses.cannot_reveal]
+    if diagram is not None:
+        facts.append(("diagram", str(diagram)))
+    print_facts("audit", facts)

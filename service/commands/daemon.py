@@ -1,0 +1,100 @@
+"""`fringed daemon`, `fringed worker`, `fringed status`: the processes of a rig, and a look at them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from service.commands.options import AsJson
+from service.terminal import print_facts, print_json, print_table
+
+DEFAULT_ENDPOINT = "ipc:///run/fringed/control.ipc"
+
+
+def daemon(
+    config: Annotated[str, typer.Argument(metavar="CONFIG", help="A rig file, or simulated[:SCENE].")],
+    connect: Annotated[
+        str | None,
+        typer.Option("--endpoint", metavar="ENDPOINT", help="Listen here instead of the rig file's endpoint."),
+    ] = None,
+    state: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for jobs and captures that outlive the daemon.")
+    ] = None,
+) -> int:
+    """Drive a rig and answer clients, until told to stop.
+
+    \b
+    Examples:
+      fringed daemon /etc/fringed/rig.toml
+      fringed daemon simulated --endpoint ipc:///tmp/try.ipc --state /tmp/try
+    """
+    from service.config import load_rig  # noqa: PLC0415
+    from service.daemon import run_daemon  # noqa: PLC0415
+
+    rig = load_rig(config)
+    run_daemon(rig, state_dir=state or _state_folder(), endpoint=connect or rig.daemon.endpoint, lifeline=False)
+    return 0
+
+
+def worker(
+    connect: Annotated[str, typer.Option("--connect", metavar="ENDPOINT", help="The daemon's endpoint for workers.")],
+) -> int:
+    """Decode for a daemon, beside the workers it starts itself.
+
+    \b
+    Examples:
+      fringed worker --connect ipc:///run/fringed/worker.ipc
+    """
+    from service.worker import run_worker  # noqa: PLC0415
+
+    run_worker(connect)
+    return 0
+
+
+def status(
+    connect: Annotated[
+        str, typer.Option("--connect", metavar="ENDPOINT", help="The daemon's endpoint.")
+    ] = DEFAULT_ENDPOINT,
+    as_json: AsJson = False,
+) -> int:
+    """Ask a running daemon how it is.
+
+    \b
+    Examples:
+      fringed status
+      fringed status --connect ipc:///tmp/try.ipc --json
+    """
+    from scanner.client import Client  # noqa: PLC0415
+
+    with Client(connect, name="fringed status") as client:
+        content = client.status()
+        scans = client.list_scans()
+    if as_json:
+        print_json({**content, "scans": scans})
+        return 0
+    print_facts("daemon", [(name, _flat(value)) for name, value in content.items()])
+    if scans:
+        columns = ("id", "state", "method", "created", "reason")
+        rows = ([entry.get(column) if entry.get(column) is not None else "" for column in columns] for entry in scans)
+        print_table("scans", columns, rows)
+    return 0
+
+
+def _flat(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_flat(inner)}" for name, inner in value.items())
+    if isinstance(value, list):
+        return "; ".join(map(_flat, value)) or "none"
+    return str(value)
+
+
+def _state_folder() -> Path:
+    """Where systemd says, or the system's place for root, or this user's."""
+    if given := os.environ.get("STATE_DIRECTORY"):
+        return Path(given.split(":")[0])
+    if os.geteuid() == 0:
+        return Path("/var/lib/fringed")
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "fringed"

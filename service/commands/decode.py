@@ -1,0 +1,82 @@
+"""`fringed decode`: a capture folder, from here or from elsewhere, to a scan. Needs no daemon and no device."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.commands.options import (
+    AsJson,
+    Box,
+    Depth,
+    EdgeFilter,
+    Force,
+    MinConfidence,
+    OutputFolder,
+    filter_members,
+)
+from service.commands.summary import print_summary
+from service.terminal import print_error, print_json, progress_lines
+
+
+def decode(
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture folder, or its JSON file.")],
+    calibration: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Calibration to use instead of the capture's own.")
+    ] = None,
+    output: OutputFolder = None,
+    decoder: Annotated[str, typer.Option(metavar="NAME", help="Decoder, by name.")] = "default",
+    depth: Depth = None,
+    box: Box = None,
+    min_confidence: MinConfidence = None,
+    edge_filter: EdgeFilter = True,
+    compare_truth: Annotated[
+        bool, typer.Option("--compare-truth", help="Captures of simulated rigs: compare with the truth.")
+    ] = False,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> int:
+    """Decode a capture into a point cloud.
+
+    Without -o the files go to the folder scan beside the capture's JSON file.
+
+    \b
+    Examples:
+      fringed decode scan/capture -o again --no-edge-filter
+      fringed decode skull/capture-gray.json --calibration skull/calibration.json
+      fringed decode old/capture --depth 380:430 --force
+    """
+    filters = filter_members(depth, box, min_confidence, edge_filter=edge_filter)
+    began = time.monotonic()
+    with progress_lines() as lines:
+        lines.stage("opening the capture")
+        from scanner.capture import Capture  # noqa: PLC0415  (array libraries and kernels)
+        from scanner.reconstruct import DecodeOptions, calibration_for, reconstruct  # noqa: PLC0415
+        from scanner.storage import prepare_output  # noqa: PLC0415
+
+        options = DecodeOptions.from_dict({"decoder": decoder, "filters": filters, "compare_truth": compare_truth})
+        opened = Capture.open(capture)
+        lens_file = calibration_for(opened, calibration)
+        folder = output or opened.path / "scan"
+        existed = folder.exists()
+        prepare_output(folder, force=force)
+        try:
+            made = reconstruct(opened, lens_file, options, lines.stage)
+            lines.stage("writing files")
+            names = made.save(folder)
+        except BaseException:
+            if not existed and not any(folder.iterdir()):
+                folder.rmdir()
+            raise
+    seconds = time.monotonic() - began
+    if made.xyz is None:
+        print_error("no calibration: values are decoded, but no points", "--calibration FILE", label="warning")
+    if as_json:
+        files = [str(folder / name) for name in names]
+        print_json({"folder": str(folder), "seconds": round(seconds, 3), "files": files, "report": made.report})
+    else:
+        print_summary(folder, made.report, seconds)
+    return 0

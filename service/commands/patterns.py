@@ -1,0 +1,126 @@
+"""`fringed patterns`: the images of a method as PNG files, with the description that decoding needs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.commands.options import (
+    AsJson,
+    AxisOption,
+    Bits,
+    Carriers,
+    Force,
+    Frequencies,
+    Levels,
+    Method,
+    PatternOptions,
+    Profile,
+    Shifts,
+)
+from service.terminal import print_facts, print_json, progress_lines
+
+if TYPE_CHECKING:
+    from scanner.patterns import PatternSequence
+
+PATTERN_FILE = "pattern.json"
+
+
+def patterns(
+    method: Annotated[Method, typer.Argument(metavar="METHOD", help="pmp, mcp or gray.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write to.")],
+    size: Annotated[str, typer.Option(metavar="WxH", help="The projector's size, pixels.")] = "1152x864",
+    frequencies: Frequencies = None,
+    shifts: Shifts = None,
+    axis: AxisOption = None,
+    bits: Bits = None,
+    carriers: Carriers = None,
+    profile: Profile = None,
+    levels: Levels = None,
+    gamma: Annotated[
+        float | None, typer.Option(min=0.1, max=10.0, help="The projector's gamma, corrected for in the images.")
+    ] = None,
+    bracketed: Annotated[
+        bool, typer.Option("--bracketed", help="With the sentinels and order bars that a scan projects.")
+    ] = False,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> int:
+    """Write a method's images as PNG files, and pattern.json.
+
+    For projectors driven by other programs: project the images in the order of pattern.json, capture one frame of
+    each, and put the description into a capture.json for `fringed decode`.
+
+    \b
+    Examples:
+      fringed patterns pmp -o images --size 1920x1080 --frequencies 1,8,64 --shifts 8 --axis x
+      fringed patterns mcp -o images --size 1152x864 --gamma 2.2
+      fringed patterns gray -o images --bits 10
+    """
+    from scanner.errors import ScannerError  # noqa: PLC0415
+    from scanner.storage import prepare_output, replace_json  # noqa: PLC0415
+
+    members = PatternOptions(frequencies, shifts, axis, bits, carriers, profile, levels).members(method)
+    try:
+        sequence = _sequence(method, members, _size(size), gamma, bracketed=bracketed)
+    except ScannerError as error:
+        raise typer.BadParameter(f"{error}{f' ({error.hint})' if error.hint else ''}") from error
+    prepare_output(output, force=force)
+    names = [f"{position:03d}.png" for position in range(len(sequence))]
+    with progress_lines() as lines:
+        lines.stage("writing images", len(names))
+        for position, name in enumerate(names):
+            _write_png(output / name, sequence.image(position))
+            lines.advance(position + 1, len(names), f"{position + 1} of {len(names)}")
+        projector = {"width": sequence.projector.width, "height": sequence.projector.height}
+        content = {
+            "format": "fringed-pattern",
+            "version": 1,
+            "projector": projector,
+            "pattern": sequence.describe(),
+            "images": names,
+        }
+        replace_json(output / PATTERN_FILE, content)
+    if as_json:
+        print_json({"folder": str(output), **content})
+    else:
+        print_facts("patterns", [("images", len(names)), ("description", output / PATTERN_FILE)])
+    return 0
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and 2 <= int(width) <= 16_384 and 2 <= int(height) <= 16_384):
+        raise typer.BadParameter(f"--size: expected WIDTHxHEIGHT in pixels, 2 .. 16384 each, got {text!r}")
+    return int(width), int(height)
+
+
+def _sequence(
+    method: Method, members: dict[str, Any], size: tuple[int, int], gamma: float | None, *, bracketed: bool
+) -> PatternSequence:
+    """The sequence to write: the method's images alone, or with those that a scan puts around them."""
+    from scanner.patterns import PatternSequence, ProjectorSize  # noqa: PLC0415
+    from scanner.patterns.sequence import Precorrection  # noqa: PLC0415
+    from service.scan_setup import pattern_for  # noqa: PLC0415
+
+    projector = ProjectorSize(*size)
+    pattern = pattern_for(method.value, members, "y", projector)
+    precorrection = None if gamma is None else Precorrection(gamma=gamma)
+    if bracketed:
+        return PatternSequence.bracketed(projector, pattern, precorrection)
+    pattern.validate(projector)
+    return PatternSequence(projector, pattern, precorrection=precorrection)
+
+
+def _write_png(path: Path, image: Any) -> None:
+    import cv2  # noqa: PLC0415
+
+    from scanner.errors import StorageError  # noqa: PLC0415
+    from scanner.storage import replace_file  # noqa: PLC0415
+
+    whole, encoded = cv2.imencode(".png", image)
+    if not whole:
+        raise StorageError(f"{path}: the image could not be encoded")
+    replace_file(path, encoded.tobytes())

@@ -1,0 +1,224 @@
+"""`fringed scan`: one scan, from a running daemon or from a private one that lives as long as the command."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from service.commands.options import (
+    AsJson,
+    AxisOption,
+    Bits,
+    Box,
+    Carriers,
+    Connect,
+    Depth,
+    EdgeFilter,
+    Force,
+    Frequencies,
+    Levels,
+    Method,
+    MinConfidence,
+    OutputFolder,
+    PatternOptions,
+    Profile,
+    Shifts,
+    filter_members,
+)
+from service.commands.summary import print_summary
+from service.terminal import ProgressLines, print_json, progress_lines
+
+if TYPE_CHECKING:
+    from scanner.client import Client
+    from scanner.wire import Event
+
+INCOMING = ".incoming"
+"""Folder inside the output folder where files arrive, until all are there"""
+
+CANCEL_S = 5.0
+"""How long an interrupted command waits to hear that its scan has stopped"""
+
+
+def scan(
+    rig: Annotated[
+        str | None,
+        typer.Option(metavar="RIG", help="A rig file, or simulated[:SCENE], as simulated:bench2026/sphere_board."),
+    ] = None,
+    method: Annotated[Method, typer.Option(help="What to project.")] = Method.PMP,
+    output: OutputFolder = None,
+    connect: Connect = None,
+    exposure: Annotated[
+        str | None, typer.Option(metavar="auto|US", help="Exposure: microseconds, or auto (test shots first).")
+    ] = None,
+    frequencies: Frequencies = None,
+    shifts: Shifts = None,
+    axis: AxisOption = None,
+    bits: Bits = None,
+    carriers: Carriers = None,
+    profile: Profile = None,
+    levels: Levels = None,
+    repeat: Annotated[int, typer.Option(min=1, max=1000, help="Repetitions of the whole sequence.")] = 1,
+    depth: Depth = None,
+    box: Box = None,
+    min_confidence: MinConfidence = None,
+    edge_filter: EdgeFilter = True,
+    decoder: Annotated[str, typer.Option(help="Decoder, by name.")] = "default",
+    compare_truth: Annotated[
+        bool, typer.Option("--compare-truth", help="Simulated rigs: compare with the truth, in the report and a map.")
+    ] = False,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> int:
+    """Scan: project, capture, decode; a point cloud, a picture and a report.
+
+    Without --rig and --connect the rig is the simulated one. Without -o the folder is scan-DATE-TIME.
+
+    \b
+    Examples:
+      fringed scan                                         the simulated rig, PMP
+      fringed scan --method mcp -o out                     one frame
+      fringed scan --rig bench.toml --depth 400:700        real devices
+      fringed scan --connect ipc:///run/fringed/control.ipc
+      fringed scan --frequencies 1,8,64 --shifts 4,4,16 --json
+    """
+    if rig is not None and connect is not None:
+        raise typer.BadParameter("--rig and --connect exclude each other: a running daemon has a rig of its own")
+    members = PatternOptions(frequencies, shifts, axis, bits, carriers, profile, levels).members(method)
+    params: dict[str, Any] = {
+        "pattern": members or None,
+        "exposure": None if exposure is None else _exposure(exposure),
+        "decoder": decoder,
+        "filters": filter_members(depth, box, min_confidence, edge_filter=edge_filter),
+        "compare_truth": compare_truth,
+        "repeat": repeat,
+    }
+    folder = output or Path(datetime.now().astimezone().strftime("scan-%Y%m%d-%H%M%S"))
+    began = time.monotonic()
+    with _output(folder, force=force), progress_lines() as lines, _daemon(rig, connect, lines) as endpoint:
+        report = _scan(endpoint, method, params, folder, lines)
+    seconds = time.monotonic() - began
+    files = sorted(str(path) for path in folder.rglob("*") if path.is_file())
+    if as_json:
+        print_json({"folder": str(folder), "seconds": round(seconds, 3), "files": files, "report": report})
+    else:
+        print_summary(folder, report, seconds)
+    return 0
+
+
+def _exposure(text: str) -> float | Literal["auto"]:
+    if text == "auto":
+        return "auto"
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"--exposure: expected auto or microseconds, got {text!r}") from error
+    if not 1 <= value <= 10_000_000:
+        raise typer.BadParameter(f"--exposure: expected 1 .. 10000000 microseconds, got {text!r}")
+    return value
+
+
+@contextmanager
+def _output(folder: Path, *, force: bool) -> Iterator[None]:
+    """The output folder; one that was made for a scan that fails is removed again."""
+    from scanner.storage import prepare_output  # noqa: PLC0415
+
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    prepare_output(folder, force=force)
+    try:
+        yield
+    except BaseException:
+        shutil.rmtree(folder / INCOMING, ignore_errors=True)
+        for path in new:
+            if any(path.iterdir()):
+                break
+            path.rmdir()
+        raise
+
+
+@contextmanager
+def _daemon(rig: str | None, connect: str | None, lines: ProgressLines) -> Iterator[str]:
+    """Endpoint of the daemon to ask: the one named, or a private one with this rig."""
+    if connect is not None:
+        yield connect
+        return
+    from service.config import load_rig  # noqa: PLC0415
+    from service.private import private_daemon  # noqa: PLC0415
+
+    config = load_rig(rig or "simulated")
+    lines.stage(f"starting {config.rig.name}")
+    with private_daemon(config) as endpoint:
+        yield endpoint
+
+
+def _scan(
+    endpoint: str, method: Method, params: Mapping[str, Any], folder: Path, lines: ProgressLines
+) -> dict[str, Any]:
+    """Start the job, follow it, fetch its files into place; returns the report."""
+    from scanner.client import Client  # noqa: PLC0415
+    from scanner.session import raise_unless_done  # noqa: PLC0415
+
+    with Client(endpoint, name="fringed scan") as client:
+        job_id = client.start_scan(method.value, **params)
+        try:
+            outcome = client.wait(job_id, _follower(lines))
+            raise_unless_done(outcome)
+            lines.stage("fetching files")
+            incoming = folder / INCOMING
+            client.fetch(job_id, incoming, lambda _, done, total: lines.advance(done, total))
+        except (KeyboardInterrupt, SystemExit):
+            _cancel(client, job_id)
+            raise
+    _into_place(incoming, folder)
+    return dict(outcome["report"])
+
+
+def _follower(lines: ProgressLines) -> Callable[[Event], None]:
+    """Draws a job's events."""
+
+    def follow(event: Event) -> None:
+        fields = event.fields
+        match event.kind:
+            case "queued":
+                lines.stage("waiting for the rig")
+            case "started" | "plan":
+                lines.stage("preparing")
+            case "frame":
+                done, total = int(fields.get("captured", 0)), int(fields.get("total", 0))
+                lines.stage("capturing", total)
+                lines.advance(done, total, f"{done} of {total} frames")
+            case "retake":
+                lines.note(f"retake: {fields.get('reason') or fields.get('frames') or ''}".rstrip(": "))
+            case "decoding" | "acquired":
+                lines.stage(str(fields.get("stage") or "decoding"))
+            case "decoded":
+                lines.stage("writing files")
+
+    return follow
+
+
+def _cancel(client: Client, job_id: str) -> None:
+    client.timeout_s = CANCEL_S
+    client.cancel(job_id)
+
+
+def _into_place(incoming: Path, folder: Path) -> None:
+    """Move what has arrived whole into the output folder, in place of what an earlier scan left there."""
+    from scanner.storage import storage_errors, sync_folder  # noqa: PLC0415
+
+    with storage_errors(folder):
+        for name in ("report.json", "error_map.png", "cloud.ply"):  # files that not every scan has
+            (folder / name).unlink(missing_ok=True)
+        for path in sorted(incoming.iterdir(), key=lambda path: path.name == "report.json"):
+            target = folder / path.name
+            if target.is_dir():
+                shutil.rmtree(target)
+            path.replace(target)
+        incoming.rmdir()
+        sync_folder(folder)

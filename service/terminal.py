@@ -1,0 +1,157 @@
+"""What a person at a terminal sees of a command: progress and errors on standard error, results on standard output.
+
+`rich` draws; it is imported when something is drawn, so that short commands stay quick. With `--json` standard output
+holds one JSON document and nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from scanner.errors import ScannerError
+
+
+class ProgressLines:
+    """Stages of a job, one line each; a stage with a known length has a bar.
+
+    On a terminal lines are drawn in place; elsewhere (a log, a pipe) each stage is one plain line when it ends.
+    """
+
+    def __init__(self, progress: Progress | None) -> None:
+        self._progress = progress
+        self._task: TaskID | None = None
+        self._stage = ""
+        self._note = ""
+
+    def stage(self, name: str, total: float | None = None) -> None:
+        """Begin a stage; the one before is done. The same name again changes nothing."""
+        if name == self._stage:
+            return
+        self._end()
+        self._stage, self._note = name, ""
+        if self._progress is not None:
+            self._task = self._progress.add_task(name, total=total, note="")
+
+    def advance(self, done: float, total: float | None, note: str = "") -> None:
+        """Say how far the stage has come."""
+        self._note = note
+        if self._progress is not None and self._task is not None:
+            self._progress.update(self._task, completed=done, total=total, note=note)
+
+    def note(self, text: str) -> None:
+        """A line that stays: something a reader will want to know later (a retake, a warning)."""
+        if self._progress is not None:
+            self._progress.console.print(text, markup=False, highlight=False)
+        else:
+            print(text, file=sys.stderr, flush=True)
+
+    def _end(self) -> None:
+        if not self._stage:
+            return
+        if self._progress is not None and self._task is not None:
+            task = self._progress.tasks[self._progress.task_ids.index(self._task)]
+            total = task.total if task.total is not None else 1
+            self._progress.update(self._task, completed=total, total=total)
+        else:
+            print(f"{self._stage}{f' ({self._note})' if self._note else ''}", file=sys.stderr, flush=True)
+        self._stage, self._task = "", None
+
+
+@contextmanager
+def progress_lines() -> Iterator[ProgressLines]:
+    """Progress on standard error while the block runs."""
+    if not sys.stderr.isatty():
+        lines = ProgressLines(None)
+        yield lines
+        lines._end()
+        return
+    from rich.console import Console  # noqa: PLC0415  (drawn only here)
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn  # noqa: PLC0415
+
+    columns = (
+        SpinnerColumn(finished_text="[green]✓"),
+        TextColumn("{task.description:<22}"),
+        BarColumn(bar_width=32),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        lines = ProgressLines(progress)
+        yield lines
+        lines._end()
+
+
+def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """A table with a heading on standard output; plain columns where that is no terminal."""
+    cells = [[str(cell) for cell in row] for row in rows]
+    if not sys.stdout.isatty():
+        widths = [max(map(len, column)) for column in zip(header, *cells, strict=True)]
+        for row in (header, *cells):
+            print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        return
+    from rich.console import Console  # noqa: PLC0415
+    from rich.markup import escape  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title=title, title_justify="left", title_style="bold")
+    for name in header:
+        table.add_column(name, overflow="fold")
+    for row in cells:
+        table.add_row(*map(escape, row))
+    Console().print(table)
+
+
+def print_facts(title: str, facts: Sequence[tuple[str, Any]]) -> None:
+    """Pairs of name and value, one a line, on standard output."""
+    if not sys.stdout.isatty():
+        width = max((len(name) for name, _ in facts), default=0)
+        for name, value in facts:
+            print(f"{name.ljust(width)}  {value}".rstrip())
+        return
+    from rich.console import Console  # noqa: PLC0415
+    from rich.markup import escape  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title=title, title_justify="left", title_style="bold", show_header=False)
+    table.add_column(style="cyan")
+    table.add_column(overflow="fold")
+    for name, value in facts:
+        table.add_row(escape(name), escape(str(value)))
+    Console().print(table)
+
+
+def print_json(content: Any) -> None:
+    """The one JSON document on standard output. Numbers that JSON has no form for (NaN, infinity) become null."""
+    print(json.dumps(_finite(content), indent=1, ensure_ascii=False, default=str), flush=True)
+
+
+def print_error(message: str, hint: str | None = None, *, label: str = "error") -> None:
+    """An error (or a warning), and what to do about it, on standard error."""
+    colour = sys.stderr.isatty() and "NO_COLOR" not in os.environ
+    red, faint, plain = ("\x1b[31m", "\x1b[2m", "\x1b[0m") if colour else ("", "", "")
+    print(f"{red}{label}:{plain} {message}", file=sys.stderr)
+    if hint:
+        print(f"{faint}hint:{plain} {hint}", file=sys.stderr, flush=True)
+
+
+def error_document(error: ScannerError) -> dict[str, Any]:
+    """What `--json` prints of an error."""
+    return {"error": {"code": error.code, "message": str(error), **error.data()}}
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if value - value == 0 else None
+    if isinstance(value, Mapping):
+        return {str(key): _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    return value
