@@ -10,8 +10,8 @@ have seen both sides of it: both fall. What is left of a flying sheet are specks
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import cv2
@@ -70,9 +70,13 @@ class FilterSettings:
         if self.box is not None:
             _check_limits(self.box, "box", BOX_KEYS)
 
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data; a side without a limit is None."""
+        return {key: _limits(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> FilterSettings:
-        """The settings that `dataclasses.asdict` described; absent members have their defaults.
+        """The settings that `as_dict` (or `dataclasses.asdict`) described; absent members have their defaults.
 
         Raises:
             ConfigError: an unknown member, or a value that makes no sense.
@@ -84,7 +88,7 @@ class FilterSettings:
         try:
             for key in ("depth", "box"):
                 if key in members:
-                    members[key] = tuple(float(limit) for limit in members[key])
+                    members[key] = _unlimited(members[key])
             return cls(**members)
         except (TypeError, ValueError) as error:
             raise ConfigError(f"filters: {error}") from error
@@ -162,7 +166,8 @@ def noise_factor(z: Map, sigma_z: Map) -> float:
     their median is blind to edges.
     """
     lines, sigmas = z[::4], sigma_z[::4]
-    second = np.abs(lines[:, :-2] - 2 * lines[:, 1:-1] + lines[:, 2:]) / sigmas[:, 1:-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        second = np.abs(lines[:, :-2] - 2 * lines[:, 1:-1] + lines[:, 2:]) / sigmas[:, 1:-1]
     second = second[np.isfinite(second)]
     if second.size < 100:
         return 1.0
@@ -188,6 +193,15 @@ def _parse(text: str, name: str, keys: tuple[str, ...]) -> list[tuple[float, flo
         raise ConfigError(f"{name} must be numbers {form} in mm, got {text!r}") from error
     _check_limits(tuple(limit for pair in limits for limit in pair), name, keys)
     return limits
+
+
+def _limits(limits: tuple[float, ...]) -> list[float | None]:
+    return [limit if math.isfinite(limit) else None for limit in limits]
+
+
+def _unlimited(limits: Sequence[float | None]) -> tuple[float, ...]:
+    sides = (-math.inf, math.inf)
+    return tuple(sides[i % 2] if limit is None else float(limit) for i, limit in enumerate(limits))
 
 
 _EXAMPLES = {"depth": "1100:1300", "box": "-100:100,-80:80,1100:1300"}

@@ -90,7 +90,7 @@ def _in_view(grid: Map, size: tuple[int, int], view: View) -> tuple[Map, NDArray
     half = np.maximum((high - low) / 2, 1e-6)
     # Far enough that the bulk fits the picture's height and width, with room around it.
     tangent = math.tan(_FOV / 2)
-    distance = 1.12 * max(half[1] / tangent, half[0] / (tangent * size[0] / size[1])) + half[2]
+    distance = 1.06 * max(half[1] / tangent, half[0] / (tangent * size[0] / size[1])) + half[2]
     focal = size[1] / 2 / tangent * SUPERSAMPLING
     moved = (grid - centre.astype(np.float32)) @ rotation.T.astype(np.float32)
     z = moved[..., 2] + np.float32(distance)

@@ -11,7 +11,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import metadata
 from pathlib import Path
@@ -85,12 +85,12 @@ class Scan:
     @property
     def decoded(self) -> Mask:
         """(H, W) bool: pixels with a decoded value, whatever the filters did."""
-        return np.isin(self.reason, _DECODED)
+        return _among(_DECODED)[self.reason]
 
     @property
     def lit(self) -> Mask:
         """(H, W) bool: pixels that the projector's light reached, as far as the decoder could see."""
-        return np.isin(self.reason, _NOT_LIT, invert=True)
+        return ~_among(_NOT_LIT)[self.reason]
 
     @property
     def points(self) -> Map:
@@ -274,7 +274,7 @@ def _report(
             "points_of_lit": _share(points, lit),
         },
         "removed": dict(removed),
-        "filters": asdict(settings),
+        "filters": settings.as_dict(),
         "rows_px": _spread(scan.rows),
         "columns_px": _spread(scan.columns),
         "sigma_rows_px": _spread(scan.sigma_rows),
@@ -315,6 +315,13 @@ def _with_same_normals(scan: Scan, report: Mapping[str, Any]) -> Scan:
 def _reasons(reason: NDArray[np.uint8]) -> dict[str, int]:
     counts = np.bincount(reason.ravel(), minlength=len(Reason))
     return {kind.name.lower(): int(counts[kind]) for kind in Reason}
+
+
+def _among(kinds: tuple[Reason, ...]) -> Mask:
+    """(256,) bool, to look reasons up in."""
+    table = np.zeros(256, np.bool_)
+    table[list(kinds)] = True
+    return table
 
 
 def _rig(calibration: Calibration) -> dict[str, Any]:
