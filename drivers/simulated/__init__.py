@@ -4,7 +4,7 @@ Device strings and options: `options`. Rigs and scenes: scenes.json, `rigs`, `sc
 `camera_driver` and `projector_driver`; nothing else of this package is meant to be imported at run time.
 """
 
-from drivers.simulated import cast, optics, sensor
+from drivers.simulated import cast, optics, sensor, textures, view
 from drivers.simulated.driver import SimulatedCameraDriver, SimulatedProjectorDriver
 
 camera_driver = SimulatedCameraDriver()
@@ -16,6 +16,8 @@ def warm_up() -> None:
     cast.warm_up()
     optics.warm_up()
     sensor.warm_up()
+    textures.warm_up()
+    view.warm_up()
 
 
 __all__ = ["camera_driver", "projector_driver", "warm_up"]

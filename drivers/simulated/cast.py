@@ -24,6 +24,8 @@ BODY_LENGTH = 16
 """kind, centre (3), axes u, v, w (9), half extents (3); see the constructors below"""
 
 MARCH_STEP_MM = 0.75
+TILE_CELLS = 12
+"""Tiles of a height field, whose greatest heights let rays pass over empty space"""
 BISECTIONS = 40
 """Halvings of one march step: 0.75 mm / 2^40 is below float64's resolution of a depth."""
 
@@ -84,19 +86,18 @@ def cast_rays(origin: Array, directions: Array, bodies: Array, field: HeightFiel
     """
     n = len(directions)
     hits = Hits(np.empty(n), np.empty(n, dtype=np.int32), np.empty((n, 3)))
-    height, slope_x, slope_y = _field_arrays(field)
-    _first_hits(origin, directions, bodies, height, slope_x, slope_y, hits.distance, hits.body, hits.normal)
+    height, slope_x, slope_y, tiles = _field_arrays(field)
+    _first_hits(origin, directions, bodies, height, slope_x, slope_y, tiles, hits.distance, hits.body, hits.normal)
     return hits
 
 
-def lit_points(points: Array, hits: Hits, light: Array, bodies: Array, field: HeightField | None) -> NDArray[np.bool_]:
-    """(N,) bool: the point faces `light` (3,) and no body stands between.
-
-    points: (N, 3), NaN where a ray met nothing.
-    """
-    lit = np.empty(len(points), dtype=np.bool_)
-    height, slope_x, slope_y = _field_arrays(field)
-    _lit(points, hits.normal, hits.body, light, bodies, height, slope_x, slope_y, lit)
+def lit_points(
+    origin: Array, directions: Array, hits: Hits, light: Array, bodies: Array, field: HeightField | None
+) -> NDArray[np.bool_]:
+    """(N,) bool: what the ray met faces `light` (3,) and no body stands between. Arguments as for `cast_rays`."""
+    lit = np.empty(len(directions), dtype=np.bool_)
+    height, slope_x, slope_y, tiles = _field_arrays(field)
+    _lit(origin, directions, hits.distance, hits.normal, hits.body, light, bodies, height, slope_x, slope_y, tiles, lit)
     return lit
 
 
@@ -104,26 +105,45 @@ def _body(kind: float, centre: Array, axes: Array, half: tuple[float, ...]) -> A
     return np.concatenate(([kind], centre, axes.ravel(), half)).astype(np.float64)
 
 
-def _field_arrays(field: HeightField | None) -> tuple[Array, Array, Array]:
+def _field_arrays(field: HeightField | None) -> tuple[Array, Array, Array, Array]:
     if field is None:
         empty = np.zeros((2, 2))
-        return empty, empty, empty
+        return empty, empty, empty, empty
     slope_y, slope_x = np.gradient(field.height, field.cell_mm)
-    return field.height, np.ascontiguousarray(slope_x), np.ascontiguousarray(slope_y)
+    return field.height, np.ascontiguousarray(slope_x), np.ascontiguousarray(slope_y), _tile_tops(field.height)
+
+
+def _tile_tops(height: Array) -> Array:
+    """Greatest height over each tile and its eight neighbours: nothing within a tile's width is higher."""
+    rows, columns = (-(-n // TILE_CELLS) for n in height.shape)
+    padded = np.pad(
+        height, ((0, rows * TILE_CELLS - height.shape[0]), (0, columns * TILE_CELLS - height.shape[1])), "edge"
+    )
+    tops = padded.reshape(rows, TILE_CELLS, columns, TILE_CELLS).max(axis=(1, 3))
+    around = np.pad(tops, 1, "edge")
+    tiles: Array = np.max([around[r : r + rows, c : c + columns] for r in range(3) for c in range(3)], axis=0)
+    return tiles
 
 
 # --- kernels: scalars in, scalars out, so that the compiler keeps them in registers ------------------------------
 
 
 @kernel
-def _first_hits(origin, directions, bodies, height, slope_x, slope_y, distance, body, normal):
+def _first_hits(origin, directions, bodies, height, slope_x, slope_y, tiles, distance, body, normal):
     ox, oy, oz = origin[0], origin[1], origin[2]
     for i in range(directions.shape[0]):
         dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
         nearest, which = np.inf, -1
         nx, ny, nz = 0.0, 0.0, 0.0
         for m in range(bodies.shape[0]):
-            t, ax, ay, az = _meet(bodies[m], height, slope_x, slope_y, ox, oy, oz, dx, dy, dz, 0.0, nearest)
+            if _passes(bodies, m, ox, oy, oz, dx, dy, dz):
+                continue
+            if bodies[m, 0] == HEIGHT_FIELD:
+                t, ax, ay, az = _meet_field(
+                    bodies[m], height, slope_x, slope_y, tiles, ox, oy, oz, dx, dy, dz, 0.0, nearest
+                )
+            else:
+                t, ax, ay, az = _meet_convex(bodies[m], ox, oy, oz, dx, dy, dz)
             if 1e-9 < t < nearest:
                 nearest, which, nx, ny, nz = t, m, ax, ay, az
         distance[i] = nearest if which >= 0 else np.nan
@@ -133,40 +153,58 @@ def _first_hits(origin, directions, bodies, height, slope_x, slope_y, distance, 
 
 
 @kernel
-def _lit(points, normal, body, light, bodies, height, slope_x, slope_y, lit):
-    for i in range(points.shape[0]):
+def _lit(origin, directions, distance, normal, body, light, bodies, height, slope_x, slope_y, tiles, lit):
+    for i in range(directions.shape[0]):
         lit[i] = False
         own = body[i]
         if own < 0:
             continue
-        ox, oy, oz = points[i, 0], points[i, 1], points[i, 2]
+        far = distance[i]
+        ox, oy, oz = (
+            origin[0] + far * directions[i, 0],
+            origin[1] + far * directions[i, 1],
+            origin[2] + far * directions[i, 2],
+        )
         dx, dy, dz = light[0] - ox, light[1] - oy, light[2] - oz
         if normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz <= 0:
             continue
         free = True
         for m in range(bodies.shape[0]):
             convex = bodies[m, 0] != HEIGHT_FIELD
-            if m == own and convex:
+            if (m == own and convex) or _passes(bodies, m, ox, oy, oz, dx, dy, dz):
                 continue  # a convex body shades itself only where it faces away
-            # A marched surface is met again by rays that leave it: begin one step and a half off.
-            start = 0.0 if m != own else 1.5 * MARCH_STEP_MM / np.sqrt(dx * dx + dy * dy + dz * dz)
-            t, _, _, _ = _meet(bodies[m], height, slope_x, slope_y, ox, oy, oz, dx, dy, dz, start, 1.0)
-            if max(start, 1e-7) < t < 1.0 - 1e-9:
+            start = 1e-7
+            if convex:
+                t, _, _, _ = _meet_convex(bodies[m], ox, oy, oz, dx, dy, dz)
+            else:
+                # A marched surface is met again by rays that leave it: begin one step and a half off.
+                start = start if m != own else 1.5 * MARCH_STEP_MM / np.sqrt(dx * dx + dy * dy + dz * dz)
+                t, _, _, _ = _meet_field(bodies[m], height, slope_x, slope_y, tiles, ox, oy, oz, dx, dy, dz, start, 1.0)
+            if start < t < 1.0 - 1e-9:
                 free = False
                 break
         lit[i] = free
 
 
 @kernel
-def _meet(body, height, slope_x, slope_y, ox, oy, oz, dx, dy, dz, start, stop):
-    """Distance (inf for none) and normal of the first meeting of one ray with one body, between start and stop."""
+def _passes(bodies, m, ox, oy, oz, dx, dy, dz):
+    """Whether a ray passes by the sphere around a ball or box, as most do; never true for other bodies."""
+    if bodies[m, 0] != SPHERE and bodies[m, 0] != BOX:
+        return False
+    px, py, pz = bodies[m, 1] - ox, bodies[m, 2] - oy, bodies[m, 3] - oz
+    forward = px * dx + py * dy + pz * dz
+    off2 = px * px + py * py + pz * pz - forward * forward / (dx * dx + dy * dy + dz * dz)
+    return off2 > bodies[m, 13] ** 2 + bodies[m, 14] ** 2 + bodies[m, 15] ** 2
+
+
+@kernel
+def _meet_convex(body, ox, oy, oz, dx, dy, dz):
+    """Distance (inf for none) and normal of the first meeting of a ray with a body that is no height field."""
     if body[0] == RECTANGLE:
         return _meet_rectangle(body, ox, oy, oz, dx, dy, dz)
     if body[0] == SPHERE:
         return _meet_sphere(body, ox, oy, oz, dx, dy, dz)
-    if body[0] == BOX:
-        return _meet_box(body, ox, oy, oz, dx, dy, dz)
-    return _meet_field(body, height, slope_x, slope_y, ox, oy, oz, dx, dy, dz, start, stop)
+    return _meet_box(body, ox, oy, oz, dx, dy, dz)
 
 
 @kernel
@@ -222,7 +260,7 @@ def _meet_box(body, ox, oy, oz, dx, dy, dz):
 
 
 @kernel
-def _meet_field(body, height, slope_x, slope_y, ox, oy, oz, dx, dy, dz, start, stop):
+def _meet_field(body, height, slope_x, slope_y, tiles, ox, oy, oz, dx, dy, dz, start, stop):
     cell, top = body[13], body[14]
     x0, y0, base = body[1], body[2], body[3]
     first, last = _clip(ox, dx, x0, x0 + cell * (height.shape[1] - 1), start, stop)
@@ -231,23 +269,34 @@ def _meet_field(body, height, slope_x, slope_y, ox, oy, oz, dx, dy, dz, start, s
     if first >= last:
         return np.inf, 0.0, 0.0, 0.0
     step = MARCH_STEP_MM / np.sqrt(dx * dx + dy * dy + dz * dz)
-    count = int((last - first) / step) + 1
-    before = first
-    for k in range(count + 1):
-        t = min(first + k * step, last)
-        if _inside(height, cell, x0, y0, base, ox + t * dx, oy + t * dy, oz + t * dz):
-            for _ in range(BISECTIONS):
-                middle = 0.5 * (before + t)
-                if _inside(height, cell, x0, y0, base, ox + middle * dx, oy + middle * dy, oz + middle * dz):
-                    t = middle
-                else:
-                    before = middle
-            gx = _bilinear(slope_x, (ox + t * dx - x0) / cell, (oy + t * dy - y0) / cell)
-            gy = _bilinear(slope_y, (ox + t * dx - x0) / cell, (oy + t * dy - y0) / cell)
-            norm = np.sqrt(gx * gx + gy * gy + 1.0)
-            return t, -gx / norm, -gy / norm, -1.0 / norm
+    across = max(abs(dx), abs(dy), 1e-12)
+    tile = cell * TILE_CELLS
+    before, t = first, first
+    while True:
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        if _inside(height, cell, x0, y0, base, x, y, z):
+            break
+        if t >= last:
+            return np.inf, 0.0, 0.0, 0.0
         before = t
-    return np.inf, 0.0, 0.0, 0.0
+        r = min(int((y - y0) / tile), tiles.shape[0] - 1)
+        c = min(int((x - x0) / tile), tiles.shape[1] - 1)
+        free = base - tiles[r, c] - z
+        ahead = step
+        if free > 0:  # nothing up to a tile's width away reaches this ray before it has gone `free` deeper
+            ahead = max(step, min(tile / across, free / dz if dz > 0 else np.inf))
+        t = min(t + ahead, last)
+    after = t
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (before + after)
+        if _inside(height, cell, x0, y0, base, ox + middle * dx, oy + middle * dy, oz + middle * dz):
+            after = middle
+        else:
+            before = middle
+    u, v = (ox + after * dx - x0) / cell, (oy + after * dy - y0) / cell
+    gx, gy = _bilinear(slope_x, u, v), _bilinear(slope_y, u, v)
+    norm = np.sqrt(gx * gx + gy * gy + 1.0)
+    return after, -gx / norm, -gy / norm, -1.0 / norm
 
 
 @kernel
@@ -279,4 +328,4 @@ def warm_up() -> None:
     bodies = np.stack((rectangle(np.array([0.0, 0.0, 20.0]), np.eye(3)[0], np.eye(3)[1]), height_body(field)))
     rays = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 1.0]])
     hits = cast_rays(np.zeros(3), rays, bodies, field)
-    lit_points(rays * hits.distance[:, None], hits, np.array([0.0, -5.0, 0.0]), bodies, field)
+    lit_points(np.zeros(3), rays, hits, np.array([0.0, -5.0, 0.0]), bodies, field)

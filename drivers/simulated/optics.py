@@ -1,4 +1,4 @@
-"""From a projected image to the light on the camera's pixels: projector optics, shading, lookup.
+"""From a projected image to the light on the camera's pixels: the projector's optics, and a lookup per pixel.
 
 An image becomes a table of the light in its own plane (gamma, then pixel square and lens blur, evaluated exactly at
 positions finer than the pixel grid); a camera pixel looks its projector coordinate up there, linearly. An image that
@@ -20,10 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from drivers.simulated.cast import cast_rays, lit_points
-from drivers.simulated.rigs import Rig
-from drivers.simulated.scenes import Material, Scene, SceneOptions, build_scene
-from scanner.devices import Truth
 from scanner.kernel import kernel
 
 Array = NDArray[np.float64]
@@ -32,10 +28,6 @@ Image = NDArray[np.uint8]
 
 STEPS_PER_PX_LINE = 16
 STEPS_PER_PX_GRID = 2
-SUBSAMPLES = 4
-"""A textured pixel's footprint is sampled SUBSAMPLES x SUBSAMPLES times."""
-GLOSS_EXPONENT = 40.0
-"""Width of the highlight (Blinn 1977): half its height 10 degrees off."""
 
 
 @dataclass(frozen=True)
@@ -58,22 +50,6 @@ class Optics:
     """exponent p: the camera's image darkens off its axis as cos^p"""
     noise: bool = True
     """false: neither shot nor read noise, for tests of exactness"""
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A scene as the camera's pixels see it, all (H, W).
-
-    row, column: float32 projector coordinates + 0.5 (so the picture begins at 0), 0 where not lit. shade: reflected
-    light for full-on light, in shares of what a white facing plane at the aim point would reflect; 0 where not lit.
-    floor: reflected ambient light in the same unit.
-    """
-
-    row: Plane
-    column: Plane
-    shade: Plane
-    floor: Plane
-    truth: Truth
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,12 +121,15 @@ def grid_of_light(image: Image, response: Plane, sigma_px: float) -> Grid:
     return Grid(steps, fine)
 
 
-def look_up(light: Light, view: View, gain: Plane, floor: Plane, out: Plane) -> None:
-    """out = light at each camera pixel * gain + floor, all (H, W) float32; out may be floor."""
+def look_up(light: Light, row: Plane, column: Plane, gain: Plane, floor: Plane, out: Plane) -> None:
+    """out = light at each camera pixel * gain + floor, all (H, W) float32; out may be floor.
+
+    row, column: projector coordinates + 0.5, so that the picture begins at 0; within the picture.
+    """
     if isinstance(light, Grid):
-        _look_up_grid(view.row, view.column, light.light, np.float32(light.steps), gain, floor, out)
+        _look_up_grid(row, column, light.light, np.float32(light.steps), gain, floor, out)
     else:
-        coordinate = view.row if light.axis == "row" else view.column
+        coordinate = row if light.axis == "row" else column
         _look_up_line(coordinate, light.light, np.float32(light.steps), gain, floor, out)
 
 
@@ -190,133 +169,6 @@ def _look_up_grid(row, column, table, steps, gain, floor, out):
             i += np.uint32(1)
             lower = table[i, j] + a * (table[i, j + np.uint32(1)] - table[i, j])
             out[r, c] = (upper + b * (lower - upper)) * gain[r, c] + floor[r, c]
-
-
-# --- the scene -----------------------------------------------------------------------------------------------------
-
-
-def view_scene(rig: Rig, scene: Scene, optics: Optics, stride: int = 1) -> View:
-    """Cast and shade a scene; stride > 1 looks at every stride-th pixel only."""
-    camera, projector = rig.calibration.camera, rig.calibration.projector
-    grid = camera.pixel_grid()[::stride, ::stride]
-    shape = grid.shape[:2]
-    directions = _directions(rig, grid)
-    origin = rig.to_scene(np.zeros(3))
-    hits = cast_rays(origin, directions, scene.bodies, scene.field)
-    xyz = directions * (hits.distance * rig.scale)[:, None]
-    light_at = rig.to_scene(rig.calibration.projector_centre)
-    lit = lit_points(origin + directions * hits.distance[:, None], hits, light_at, scene.bodies, scene.field)
-    seen = rig.calibration.to_projector(xyz)
-    pixels = projector.project(seen)
-    width, height = projector.size
-    with np.errstate(invalid="ignore"):
-        lit &= (seen[:, 2] > 0) & (np.abs(pixels - ((width - 1) / 2, (height - 1) / 2)) < (width / 2, height / 2)).all(
-            -1
-        )
-    albedo, gloss = _reflectance(scene, hits.body, directions, origin, shape)
-    vignette = (1.0 + (directions[:, :2] ** 2).sum(-1)) ** (-0.5 * optics.vignetting)
-    irradiance, highlight = _irradiance(rig, xyz, seen, hits.normal, optics)
-    shade = np.where(lit, (albedo * irradiance + gloss * highlight) * vignette, 0.0)
-    floor = np.where(hits.body >= 0, albedo * optics.ambient * vignette, 0.0)
-    place = np.where(lit[:, None], pixels + 0.5, 0.0).astype(np.float32)
-    place = np.clip(place, 0.0, np.nextafter(np.array([width, height], dtype=np.float32), np.float32(0.0)))
-    return View(
-        row=np.ascontiguousarray(place[:, 1]).reshape(shape),
-        column=np.ascontiguousarray(place[:, 0]).reshape(shape),
-        shade=shade.astype(np.float32).reshape(shape),
-        floor=floor.astype(np.float32).reshape(shape),
-        truth=Truth(
-            rows=pixels[:, 1].astype(np.float32).reshape(shape),
-            columns=pixels[:, 0].astype(np.float32).reshape(shape),
-            xyz=xyz.astype(np.float32).reshape(*shape, 3),
-            lit=lit.reshape(shape),
-        ),
-    )
-
-
-def white_level(rig: Rig, optics: Optics) -> float:
-    """99th percentile of the reflected light of the full-on board, in the unit of `View.shade`.
-
-    The exposure rule of scenes.json: this level is 230 grey levels of 255 at the nominal exposure.
-    """
-    stride = max(1, rig.calibration.camera.size[0] // 160)
-    board = view_scene(rig, build_scene("board", SceneOptions(), rig, 0), optics, stride)
-    return float(np.percentile(board.shade + board.floor, 99))
-
-
-def _directions(rig: Rig, grid: Array) -> Array:
-    """(N, 3) viewing directions with z = 1."""
-    camera = rig.calibration.camera
-    if np.any(camera.distortion):
-        rays = camera.normalised(grid)
-    else:
-        m = camera.matrix
-        rays = (grid - (m[0, 2], m[1, 2])) / (m[0, 0], m[1, 1])
-    directions = np.ones((rays.shape[0] * rays.shape[1], 3))
-    directions[:, :2] = rays.reshape(-1, 2)
-    return directions
-
-
-def _irradiance(rig: Rig, xyz: Array, seen: Array, normal: Array, optics: Optics) -> tuple[Array, Array]:
-    """Full-on light on each point, 1 at a facing aim point, and the highlight it gives a glossy one.
-
-    Each projector pixel carries the same light into a solid angle that shrinks as cos^3 off the axis: on a plane
-    across the axis the picture is evenly bright, but for `projector_falloff`.
-    """
-    to_light = rig.calibration.projector_centre - xyz
-    distance = np.sqrt((to_light**2).sum(-1))
-    to_light /= distance[:, None]
-    facing = np.maximum((to_light * normal).sum(-1), 0.0)
-    off_axis = seen[:, 2] / distance
-    aim = rig.calibration.to_projector(rig.aim)
-    aim_distance = float(np.linalg.norm(aim))
-    aim_off_axis = float(aim[2]) / aim_distance
-    exponent = optics.projector_falloff - 3.0
-    arriving = (aim_distance / distance) ** 2 * (off_axis / aim_off_axis) ** exponent
-    to_eye = -xyz / np.sqrt((xyz**2).sum(-1))[:, None]
-    half = to_light + to_eye
-    half /= np.sqrt((half**2).sum(-1))[:, None]
-    highlight = np.maximum((half * normal).sum(-1), 0.0) ** GLOSS_EXPONENT * arriving
-    return arriving * facing, highlight
-
-
-def _reflectance(
-    scene: Scene, body: NDArray[np.int32], directions: Array, origin: Array, shape: tuple[int, ...]
-) -> tuple[Plane, Plane]:
-    albedo = np.zeros(len(body), dtype=np.float32)
-    gloss = np.zeros(len(body), dtype=np.float32)
-    for index, material in enumerate(scene.materials):
-        on = body == index
-        gloss[on] = material.gloss
-        if isinstance(material.albedo, float):
-            albedo[on] = material.albedo
-        else:
-            albedo[on] = _textured(material, scene.bodies[index], on, directions, origin, shape)
-    return albedo, gloss
-
-
-def _textured(
-    material: Material,
-    rectangle: Array,
-    on: NDArray[np.bool_],
-    directions: Array,
-    origin: Array,
-    shape: tuple[int, ...],
-) -> Plane:
-    """Mean albedo over the footprint of each pixel of `on`, on the rectangle's own plane."""
-    assert callable(material.albedo)  # noqa: S101  (for the type checker; the caller chose)
-    centre, u_axis, v_axis, normal = (rectangle[k : k + 3] for k in (1, 4, 7, 10))
-    points = directions * (((centre - origin) @ normal) / (directions @ normal))[:, None] + (origin - centre)
-    u, v = (points @ u_axis).reshape(shape), (points @ v_axis).reshape(shape)
-    u_down, u_across = (g.ravel()[on] for g in np.gradient(u))
-    v_down, v_across = (g.ravel()[on] for g in np.gradient(v))
-    u_on, v_on = u.ravel()[on], v.ravel()[on]
-    total = np.zeros(len(u_on), dtype=np.float32)
-    offsets = (np.arange(SUBSAMPLES) + 0.5) / SUBSAMPLES - 0.5
-    for a in offsets:
-        for b in offsets:
-            total += material.albedo(u_on + a * u_across + b * u_down, v_on + a * v_across + b * v_down)
-    return total / np.float32(SUBSAMPLES**2)
 
 
 def warm_up() -> None:

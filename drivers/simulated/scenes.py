@@ -24,9 +24,9 @@ X, Y, Z = np.eye(3)
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """How a body reflects. albedo 0..1, or a texture over the rectangle's (u, v) in mm from its centre."""
+    """How a body reflects. albedo 0..1, or a picture printed on a rectangle."""
 
-    albedo: float | textures.Texture
+    albedo: float | textures.Picture
     gloss: float = 0.0
 
 
@@ -161,13 +161,9 @@ def _wedge() -> Scene:
     planes = targets.wedge_planes()
     bodies = np.stack([rectangle(p.centre, p.u, p.v, *p.half) for p in planes])
     discs = reference()["scenes"]["wedge"]["discs"]
-    return Scene(
-        bodies,
-        tuple(
-            Material(textures.discs(p.disc_centres, float(discs["radius_mm"]), float(discs["albedo"]), _albedo()))
-            for p in planes
-        ),
-    )
+    radius, inside = float(discs["radius_mm"]), float(discs["albedo"])
+    printed = (textures.discs(p.disc_centres, radius, inside, _albedo(), p.half) for p in planes)
+    return Scene(bodies, tuple(Material(picture) for picture in printed))
 
 
 def _posed(name: str, number: int, rig: Rig, seed: int) -> Scene:

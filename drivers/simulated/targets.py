@@ -51,7 +51,7 @@ class PrintedTarget:
         corners = np.stack((x - self.columns / 2, y - self.rows / 2, np.zeros_like(x)), axis=-1)
         return np.asarray(corners.reshape(-1, 3) * square_mm, dtype=np.float64)
 
-    def texture(self, square_mm: float) -> textures.Texture:
+    def texture(self, square_mm: float) -> textures.Picture:
         """Albedo over the paper; square_mm: side of a square in the texture's own coordinates."""
         size = (self.columns * PX_PER_SQUARE, self.rows * PX_PER_SQUARE)
         if self.charuco:
@@ -60,7 +60,7 @@ class PrintedTarget:
             y, x = np.indices((size[1], size[0])) // PX_PER_SQUARE
             black = (x + y) % 2 == 0
         picture = np.where(black, np.float32(self.dark), np.float32(self.white))
-        return textures.image(picture, square_mm / PX_PER_SQUARE, self.white)
+        return textures.Picture(picture, square_mm / PX_PER_SQUARE, around=self.white)
 
 
 @dataclass(frozen=True, eq=False)

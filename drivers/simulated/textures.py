@@ -1,82 +1,111 @@
-"""Albedo over a flat body: printed samplers, chequers and discs, as functions of the position on it.
+"""Albedo over a flat body, as printed pictures: samplers, chequers, discs, targets.
 
-A texture is sampled many times within a pixel's footprint (`optics`), so it may have hard edges.
+A camera pixel sees the mean over its footprint: the picture is sampled SUBSAMPLES x SUBSAMPLES times within it.
 """
+
+# Kernels: numba types their arguments.
+# mypy: disable-error-code="no-untyped-def,no-untyped-call"
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.kernel import kernel
+
 Array = NDArray[np.float64]
 
-Texture = Callable[[Array, Array], NDArray[np.float32]]
-"""(u, v) mm from the rectangle's centre, any equal shapes, to albedo 0..1"""
-
+SUBSAMPLES = 4
 DARK, BRIGHT = 0.05, 0.9
+PX_PER_MM = 4
 
 
-def sampler() -> Texture:
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """Albedos printed on a rectangle, centred on it. values: (H, W) float32 0..1.
+
+    tiled: repeats beyond its edges; else `around` is the albedo there.
+    """
+
+    values: NDArray[np.float32]
+    mm_per_px: float
+    tiled: bool = False
+    around: float = 0.0
+
+
+def sampler() -> Picture:
     """The `textured` scene: six fields of 185 x 205 mm, repeated beyond the reference field.
 
     Chequers of 12 mm and of 4 mm, stripes of 6 mm; smooth noise, print, a dark patch with a bright rim.
     """
-    noise, text = _smooth_noise(), _print()
-
-    def albedo(u: Array, v: Array) -> NDArray[np.float32]:
-        column = np.floor(u / 185.0 + 1.5).astype(np.int64) % 3
-        row = np.floor(v / 205.0 + 1.0).astype(np.int64) % 2
-        du, dv = (u / 185.0 + 1.5) % 1.0 * 185.0, (v / 205.0 + 1.0) % 1.0 * 205.0
-        inside = (np.abs(du - 92.5) < 62.5) & (np.abs(dv - 102.5) < 72.5)
-        fields = (
-            _two(_squares(u, v, 12.0)),
-            _two(_squares(u, v, 4.0)),
-            _two(np.floor((u + v) / (6.0 * np.sqrt(2.0))).astype(np.int64) % 2 == 0),
-            _lookup(noise, du, dv),
-            _lookup(text, du, dv),
-            np.where(inside, np.float32(DARK), np.float32(0.6)),
-        )
-        return np.asarray(np.choose(row * 3 + column, fields), dtype=np.float32)
-
-    return albedo
+    y, x = np.indices((205 * PX_PER_MM, 185 * PX_PER_MM)) / PX_PER_MM
+    stripes = np.floor((x + y) / (6.0 * np.sqrt(2.0))).astype(np.int64) % 2 == 0
+    patch = (np.abs(x - 92.5) < 62.5) & (np.abs(y - 102.5) < 72.5)
+    upper = (_two(_squares(x, y, 12.0)), _two(_squares(x, y, 4.0)), _two(stripes))
+    lower = (_smooth_noise(), _print(), np.where(patch, np.float32(DARK), np.float32(0.6)))
+    values = np.vstack((np.hstack(upper), np.hstack(lower))).astype(np.float32)
+    return Picture(values, 1 / PX_PER_MM, tiled=True)
 
 
-def chequer(dark: float, bright: float, side_mm: float = 100.0) -> Texture:
-    """Squares of two albedos with edges along both axes, a dark one's corner at the centre."""
-
-    def albedo(u: Array, v: Array) -> NDArray[np.float32]:
-        return np.where(_squares(u, v, side_mm), np.float32(dark), np.float32(bright))
-
-    return albedo
+def chequer(dark: float, bright: float, side_mm: float = 100.0) -> Picture:
+    """Squares of two albedos with edges along both axes, four of them meeting at the centre."""
+    return Picture(np.array([[dark, bright], [bright, dark]], dtype=np.float32), side_mm, tiled=True)
 
 
-def discs(centres: Array, radius_mm: float, inside: float, outside: float) -> Texture:
-    """Discs on a plain ground; centres: (N, 2) mm."""
+def discs(centres: Array, radius_mm: float, inside: float, outside: float, half_mm: tuple[float, float]) -> Picture:
+    """Discs on a plain ground; centres: (N, 2) mm from the middle; half_mm: half extents of the ground."""
+    fine = 4 * PX_PER_MM
+    width, height = (int(np.ceil(2 * half * PX_PER_MM / 2)) * 2 for half in half_mm)
+    values = np.full((height, width), outside, dtype=np.float32)
+    for x, y in centres:
+        # The pixels around one disc, each the mean of 4 x 4 samples: its outline is exact to 1/16 mm.
+        left, top = int((x - radius_mm) * PX_PER_MM + width / 2) - 1, int((y - radius_mm) * PX_PER_MM + height / 2) - 1
+        size = int(2 * radius_mm * PX_PER_MM) + 4
+        at = (np.arange(size * 4) + 0.5) / fine
+        u, v = at + (left - width / 2) / PX_PER_MM - x, at + (top - height / 2) / PX_PER_MM - y
+        covered = (u[None, :] ** 2 + v[:, None] ** 2 < radius_mm**2).reshape(size, 4, size, 4).mean(axis=(1, 3))
+        values[top : top + size, left : left + size] = outside + (inside - outside) * covered
+    return Picture(values, 1 / PX_PER_MM, around=outside)
 
-    def albedo(u: Array, v: Array) -> NDArray[np.float32]:
-        result = np.full(u.shape, outside, dtype=np.float32)
-        for x, y in centres:
-            result[(u - x) ** 2 + (v - y) ** 2 < radius_mm**2] = inside
-        return result
 
-    return albedo
+def footprint_albedo(
+    picture: Picture,
+    rectangle: Array,
+    body: NDArray[np.int32],
+    index: int,
+    directions: Array,
+    origin: Array,
+    shape: tuple[int, ...],
+    albedo: NDArray[np.float32],
+) -> None:
+    """Set the albedo of every pixel that sees body `index` to the picture's mean over the pixel's footprint.
 
-
-def image(picture: NDArray[np.float32], mm_per_px: float, around: float) -> Texture:
-    """A picture (H, W) of albedos, centred; `around`: albedo beyond it."""
-    height, width = picture.shape
-
-    def albedo(u: Array, v: Array) -> NDArray[np.float32]:
-        column = np.floor(u / mm_per_px + width / 2).astype(np.int64)
-        row = np.floor(v / mm_per_px + height / 2).astype(np.int64)
-        on = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        found = picture[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-        return np.where(on, found, np.float32(around))
-
-    return albedo
+    Args:
+        picture: what is printed on it.
+        rectangle: the body, as `cast.rectangle` makes it.
+        body: (N,) which body each pixel sees.
+        index: of the rectangle.
+        directions: (N, 3) of the pixels, row by row.
+        origin: (3,) of the rays.
+        shape: (H, W) of the pixels.
+        albedo: (N,) set in place.
+    """
+    _footprints(
+        picture.values,
+        picture.mm_per_px,
+        picture.tiled,
+        np.float32(picture.around),
+        rectangle,
+        body,
+        index,
+        directions,
+        origin,
+        shape[1],
+        albedo,
+    )
 
 
 def _squares(u: Array, v: Array, side: float) -> NDArray[np.bool_]:
@@ -86,13 +115,6 @@ def _squares(u: Array, v: Array, side: float) -> NDArray[np.bool_]:
 
 def _two(dark: NDArray[np.bool_]) -> NDArray[np.float32]:
     return np.where(dark, np.float32(DARK), np.float32(BRIGHT))
-
-
-def _lookup(picture: NDArray[np.float32], x_mm: Array, y_mm: Array) -> NDArray[np.float32]:
-    """A picture with 0.25 mm pixels, nearest."""
-    row = np.minimum((y_mm * 4).astype(np.int64), picture.shape[0] - 1)
-    column = np.minimum((x_mm * 4).astype(np.int64), picture.shape[1] - 1)
-    return np.asarray(picture[row, column], dtype=np.float32)
 
 
 def _smooth_noise() -> NDArray[np.float32]:
@@ -121,3 +143,50 @@ def _print() -> NDArray[np.float32]:
     for i, line in enumerate(lines):
         cv2.putText(page, line, (30, 110 + 120 * i), cv2.FONT_HERSHEY_SIMPLEX, 1.9 - 0.05 * len(line), 18, 7 - i)
     return page.astype(np.float32) / np.float32(255)
+
+
+@kernel
+def _footprints(values, mm_per_px, tiled, around, rectangle, body, index, directions, origin, width, albedo):
+    count = directions.shape[0]
+    height_px, width_px = values.shape
+    for i in range(count):
+        if body[i] != index:
+            continue
+        u, v = _on_rectangle(rectangle, directions[i], origin)
+        beside = i + 1 if (i + 1) % width else i - 1
+        below = i + width if i + width < count else i - width
+        u1, v1 = _on_rectangle(rectangle, directions[beside], origin)
+        u2, v2 = _on_rectangle(rectangle, directions[below], origin)
+        total = np.float32(0.0)
+        for a in range(SUBSAMPLES):
+            for b in range(SUBSAMPLES):
+                s, t = (a + 0.5) / SUBSAMPLES - 0.5, (b + 0.5) / SUBSAMPLES - 0.5
+                c = int(np.floor((u + s * (u1 - u) + t * (u2 - u)) / mm_per_px + 0.5 * width_px))
+                r = int(np.floor((v + s * (v1 - v) + t * (v2 - v)) / mm_per_px + 0.5 * height_px))
+                if tiled:
+                    total += values[r % height_px, c % width_px]
+                elif 0 <= r < height_px and 0 <= c < width_px:
+                    total += values[r, c]
+                else:
+                    total += around
+        albedo[i] = total / np.float32(SUBSAMPLES * SUBSAMPLES)
+
+
+@kernel
+def _on_rectangle(rectangle, direction, origin):
+    """(u, v) mm where a ray meets the rectangle's plane."""
+    px, py, pz = rectangle[1] - origin[0], rectangle[2] - origin[1], rectangle[3] - origin[2]
+    dx, dy, dz = direction[0], direction[1], direction[2]
+    nx, ny, nz = rectangle[10], rectangle[11], rectangle[12]
+    t = (nx * px + ny * py + nz * pz) / (nx * dx + ny * dy + nz * dz)
+    rx, ry, rz = t * dx - px, t * dy - py, t * dz - pz
+    u = rx * rectangle[4] + ry * rectangle[5] + rz * rectangle[6]
+    return u, rx * rectangle[7] + ry * rectangle[8] + rz * rectangle[9]
+
+
+def warm_up() -> None:
+    """Compile the kernel (or load it from its cache)."""
+    square = np.array([0.0, 0, 0, 9, 1, 0, 0, 0, 1, 0, 0, 0, 1, 5, 5, 0])
+    rays = np.array([[0.0, 0.0, 1.0]] * 4)
+    body, albedo = np.zeros(4, dtype=np.int32), np.zeros(4, dtype=np.float32)
+    footprint_albedo(chequer(0.1, 0.9), square, body, 0, rays, np.zeros(3), (2, 2), albedo)

@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.simulated import timeline
-from drivers.simulated.optics import Light, Optics, Plane, View, look_up, view_scene, white_level
+from drivers.simulated.optics import Light, Optics, Plane, look_up
 from drivers.simulated.options import Settings, WorldSettings, check_same_world
 from drivers.simulated.rigs import Rig, rig
 from drivers.simulated.scenes import SceneOptions, build_scene
 from drivers.simulated.sensor import blur_taps, sense
 from drivers.simulated.targets import POSED
 from drivers.simulated.timeline import LoadedImage, Segment, Timeline
+from drivers.simulated.view import View, view_scene, white_level
 from scanner.clock import Clock
 from scanner.errors import DeviceBusy
 
@@ -167,7 +168,7 @@ class World:
             if segment.image is not None and weight > 0:
                 light = self._light(segment.image)
                 gain = self.view.shade if weight == 1.0 else self.view.shade * np.float32(weight)
-                look_up(light, self.view, gain, floor, out)
+                look_up(light, self.view.row, self.view.column, gain, floor, out)
                 floor = out
         if floor is not out:
             np.copyto(out, floor)
@@ -185,7 +186,7 @@ class World:
             weight = timeline.share(manner, segment, begin, begin + exposure_ns, down.astype(np.float32))
             if segment.image is not None and weight.any():
                 light = self._light(segment.image)
-                look_up(light, view, np.ascontiguousarray(view.shade * weight), out, out)
+                look_up(light, view.row, view.column, np.ascontiguousarray(view.shade * weight), out, out)
 
     def _pulsed(
         self, segments: list[Segment], start_ns: float, exposure_ns: float, readout_ns: float, out: Plane
@@ -195,7 +196,6 @@ class World:
         np.copyto(out, view.floor)
         count = PULSE_BANDS if readout_ns else 1
         for rows, begin in timeline.bands(start_ns, readout_ns, out.shape[0], count):
-            part = View(view.row[rows], view.column[rows], view.shade[rows], view.floor[rows], view.truth)
             for segment in segments:
                 if segment.image is None:
                     continue
@@ -203,7 +203,7 @@ class World:
                 if not response.any():
                     continue
                 light = segment.image.light(response, self._sigma, keep=False)
-                look_up(light, part, part.shade, out[rows], out[rows])
+                look_up(light, view.row[rows], view.column[rows], view.shade[rows], out[rows], out[rows])
 
     def _light(self, image: LoadedImage) -> Light:
         """The image's light; of large ones only the last few are kept."""
