@@ -15,14 +15,14 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.pmp_witness import MAX_DISORDER, set_witness
+from scanner.decode.pmp_witness import set_witness
 from scanner.decode.unwrapping import Ladder, plan_ladder
 from scanner.errors import DecodeError
 from scanner.patterns import PmpPattern
 from scanner.patterns.description import Axis
 from scanner.patterns.pmp import FringeSet
 from scanner.patterns.sequence import BAR_COUNT, bar_light
-from scanner.sequencer.witness import NOISE_SIGMAS, Array, Scene, Witness
+from scanner.sequencer.witness import NOISE_SIGMAS, Array, Scene, Witness, sigma_between
 
 MIN_PIXELS = 150
 """Lit pixels of the thumbnail, fewer than which prove nothing."""
@@ -30,8 +30,15 @@ MIN_PIXELS = 150
 MAX_RESIDUAL = 0.35
 """Residual over B where its cause cannot be told from the response by phase. Uncorrected gamma 2.2 leaves .2."""
 
+MAX_DISORDER = 0.15
+"""Residual over B, beyond noise, that differs from frame to frame at the same phase, which no response does. Light
+that flickers by 10 % from frame to frame leaves .06, uncorrected gamma 2.3 on a vignetted field .06."""
+
 SWAP_GAIN = 0.35
 """An exchange of two frames is believed when it brings the residual down to this share of what it was."""
+
+COPY_SIGMAS = 1.3
+"""Two frames that differ by no more than this, over the noise of full-on frames, are one picture."""
 
 MAX_MEAN_DIFFERENCE = 0.2
 """Of a set's mean from the others', rms over B, gain taken out. A doubled frame among three leaves .41; the third
@@ -42,6 +49,12 @@ HYPOTHESIS_GAIN = 0.35
 
 MIN_BARS_AGREEMENT = 0.75
 """Of pixels with the order bars: in step all but edges agree, any other order agrees in 15 of 31."""
+
+BARS_GAIN = 0.15
+"""Another place is believed when so many more pixels agree with the bars there."""
+
+NEARBY = 1.25
+"""Bars: the response of an uncorrected gamma 2.2 bends positions from three shifts of a unit frequency so far."""
 
 MIN_BARS_SEEN = 8
 """Different bars in view, fewer than which could agree by chance (2^-8)."""
@@ -127,31 +140,58 @@ def _name(fringe_set: FringeSet) -> str:
 
 
 def _residual(scene: Scene, fit: Fit, clipped: NDArray[np.bool_]) -> Witness | None:
-    """What the fit leaves: by phase where the scene shows all phases, else against exchanges of frames."""
-    count = len(fit.positions)
+    """What the fit leaves: explained by an exchange of frames, by a frame that shows another shift, or large."""
     bright = _bright(scene, fit, clipped)
-    if count < 4 or np.count_nonzero(bright) < MIN_PIXELS:
+    if len(fit.positions) < 4 or np.count_nonzero(bright) < MIN_PIXELS:
         return None
-    name = f"residual {fit.fringe_set.frequency:g}{fit.fringe_set.axis}"
-    design = _design(fit.alpha)
+    name, called = f"residual {fit.fringe_set.frequency:g}{fit.fringe_set.axis}", _name(fit.fringe_set)
+    design, frames, b = _design(fit.alpha), fit.frames[:, bright], fit.modulation[bright]
+    left, noise = _rms(design, frames, b), scene.noise / float(np.median(b))
+    limit = MAX_RESIDUAL + noise
+    if left > 3 * noise:
+        if (pair := _exchange(design, frames, b, left)) is not None:
+            wrong = tuple(sorted(fit.positions[n] for n in pair))
+            says = f"{called} fits with frames {wrong[0]} and {wrong[1]} exchanged, and not as it is"
+            return Witness(name, False, left, limit, wrong, says)
+        if wrong := _false_shifts(fit, bright, noise):
+            says = f"{called}: frames {', '.join(map(str, wrong))} show another shift than their own"
+            return Witness(name, False, left, limit, wrong, says)
+    if left > limit:
+        says = f"{called} does not fit a sinusoid: {left:.2f} B is left"
+        return Witness(name, False, left, limit, _odd_one_out(fit, bright, left), says)
     seen = set_witness(fit.fringe_set, fit.positions, fit.frames[:, bright], design, clipped[bright])
-    if seen.disorder is not None and seen.disorder > MAX_DISORDER:
-        says = f"{_name(fit.fringe_set)} does not fit a sinusoid: {seen.disorder:.2f} B that no response explains"
-        return Witness(name, False, seen.disorder, MAX_DISORDER, seen.suspects, says)
-    b = fit.modulation[bright]
-    left = _rms(design, fit.frames[:, bright], b)
-    noise = scene.noise / float(np.median(b))
-    if left > 3 * noise and (exchange := _exchange(design, fit.frames[:, bright], b, left)) is not None:
-        frames = tuple(sorted(fit.positions[n] for n in exchange))
-        says = f"{_name(fit.fringe_set)} fits with frames {frames[0]} and {frames[1]} exchanged, and not as it is"
-        return Witness(name, False, left, SWAP_GAIN * left, frames, says)
-    if left > MAX_RESIDUAL + noise:
-        frames = _odd_one_out(fit, bright, left)
-        says = f"{_name(fit.fringe_set)} does not fit a sinusoid: {left:.2f} B is left"
-        return Witness(name, False, left, MAX_RESIDUAL, frames, says)
-    value = left if seen.disorder is None else seen.disorder
-    limit = MAX_RESIDUAL if seen.disorder is None else MAX_DISORDER
-    return Witness(name, True, value, limit, says=f"{_name(fit.fringe_set)} fits a sinusoid")
+    if seen.disorder is not None and seen.disorder > MAX_DISORDER + noise:
+        says = f"{called} does not fit a sinusoid: {seen.disorder:.2f} B that no response explains"
+        return Witness(name, False, seen.disorder, MAX_DISORDER + noise, seen.suspects, says)
+    return Witness(name, True, left, limit, says=f"{called} fits a sinusoid")
+
+
+def _false_shifts(fit: Fit, bright: NDArray[np.bool_], noise: float) -> tuple[int, ...]:
+    """Frames that the others predict for another shift, and not for their own."""
+    count = len(fit.positions)
+    if count < 5:
+        return ()
+    stride = max(1, int(np.count_nonzero(bright)) // 2000)
+    frames, b = fit.frames[:, bright][:, ::stride], fit.modulation[bright][::stride]
+    steps = np.arange(fit.fringe_set.shifts)
+    alphas = fit.alpha[0] + (fit.alpha[1] - fit.alpha[0]) * steps if _whole(fit) else fit.alpha
+    wrong = []
+    for n in range(count):
+        keep = [i for i in range(count) if i != n]
+        found = _solve(_design(fit.alpha[keep]), frames[keep])
+        off = [float(np.sqrt(np.median(((row - frames[n]) / b) ** 2))) / 0.6745 for row in _predict(alphas, found)]
+        if off[n] > 4 * noise and min(off) < SWAP_GAIN * off[n]:
+            wrong.append(fit.positions[n])
+    return tuple(wrong)
+
+
+def _whole(fit: Fit) -> bool:
+    return len(fit.positions) == fit.fringe_set.shifts
+
+
+def _predict(alphas: NDArray[np.float64], found: Array) -> Array:
+    """(M, P) what frames of these shifts should show."""
+    return np.asarray(_design(alphas).astype(np.float32) @ found)
 
 
 def _rms(design: NDArray[np.float64], frames: Array, b: Array) -> float:
@@ -214,7 +254,7 @@ def _means(scene: Scene, fits: Sequence[Fit], clipped: NDArray[np.bool_]) -> lis
 
 def _copies(scene: Scene, fits: Sequence[Fit]) -> list[Witness]:
     """Frames of different patterns that are one picture: a stale buffer, a doubled frame, a flip that never came."""
-    noise = 0.9539 * scene.noise
+    noise = scene.noise
     frames: dict[int, int] = {}
     nearest = np.inf
     for f, fit in enumerate(fits):
@@ -226,20 +266,20 @@ def _copies(scene: Scene, fits: Sequence[Fit]) -> list[Witness]:
             if later is not fit and not (own and _varied(later, use)):
                 continue
             for i, j in _pairs(fit, later):
-                difference = float(np.median(np.abs(fit.frames[i][use] - later.frames[j][use])))
+                difference = sigma_between(fit.frames[i][use], later.frames[j][use])
                 expected = 8 * noise
                 if later is fit:
-                    expected = float(np.median(np.abs(fit.model(i)[use] - fit.model(j)[use])))
+                    expected = sigma_between(fit.model(i)[use], fit.model(j)[use])
                 if expected < 4 * noise:
                     continue
                 nearest = min(nearest, difference / noise)
-                if difference <= min(1.5 * noise, 0.25 * expected):
+                if difference <= min(COPY_SIGMAS * noise, 0.4 * expected):
                     frames[later.positions[j]] = fit.positions[i]
     if not np.isfinite(nearest):
         return []
     named = ", ".join(f"{later} of {earlier}" for later, earlier in sorted(frames.items()))
     says = f"copies of an earlier frame: {named}" if frames else "all frames differ"
-    return [Witness("copies", not frames, nearest, 1.5, tuple(sorted(frames)), says)]
+    return [Witness("copies", not frames, nearest, COPY_SIGMAS, tuple(sorted(frames)), says)]
 
 
 def _varied(fit: Fit, use: NDArray[np.bool_]) -> bool:
@@ -415,33 +455,71 @@ def _bars(
     if position is None or position not in scene.frames:
         cannot.append(f"{blind} (no order bars)")
         return []
-    size = scene.sequence.projector.along(axis)
-    fraction, _ = climb(ladder, cycles, centre)
-    pixel = fraction * size - pattern.origin
-    # In the middle half of each bar neither blur nor a small error of position can change what is seen.
-    within = (pixel + 0.5) * BAR_COUNT / size
-    inner = (np.abs(within % 1 - 0.5) < 0.25) & (within > 0) & (within < BAR_COUNT)
-    # Noise of the first rung decides whether a pixel's bar is known at all.
-    weight = np.sum(ladder.combinations[0] ** 2 * [2 / fit.fringe_set.shifts for fit in fits])
     b = np.min([fit.modulation[use] for fit in fits], axis=0)
-    sigma = scene.noise / b * float(np.sqrt(weight)) / (2 * np.pi) / ladder.frequencies[0] * BAR_COUNT
-    inner &= sigma < 0.5
-    seen = np.unique(np.floor(within[inner]).astype(int))
-    if np.count_nonzero(inner) < MIN_PIXELS or len(seen) < MIN_BARS_SEEN:
-        cannot.append(f"{blind} (the scene shows {len(seen)} of {BAR_COUNT} order bars)")
+    fraction, sigma = _trusted(scene, fits, ladder, cycles, centre, b)
+    bar = (fraction - (pattern.origin - 0.5) / scene.sequence.projector.along(axis)) * BAR_COUNT
+    known = sigma * BAR_COUNT < 0.5
+    seen = np.unique(np.floor(bar[known & (bar > 0) & (bar < BAR_COUNT)]).astype(int))
+    if np.count_nonzero(known) < MIN_PIXELS or len(seen) < MIN_BARS_SEEN:
+        cannot.append(f"{blind} (the scene shows {len(seen)} of {BAR_COUNT} order bars well enough)")
         return []
-    expected = bar_light(pixel[inner], size) > 0.5
     mean = np.median([fit.mean[use] for fit in fits], axis=0)
-    above = (scene.frames[position][use] - mean)[inner]
-    contrast = b[inner]
-    agrees = float(np.mean((above > 0) == expected))
+    above = (scene.frames[position][use] - mean)[known]
+    here, other, other_at = _best_places(bar[known], above > 0)
     name = f"order bars {axis}"
-    if agrees >= MIN_BARS_AGREEMENT:
-        return [Witness(name, True, agrees, MIN_BARS_AGREEMENT, says="the bars stand where the fringes say")]
-    binary = float(np.mean(np.abs(above) > 0.5 * contrast))
+    if here >= other or here >= MIN_BARS_AGREEMENT:
+        return [Witness(name, True, here, MIN_BARS_AGREEMENT, says=f"{here:.0%} agree with the fringes")]
+    binary = float(np.mean(np.abs(above) > 0.5 * b[known]))
     if binary < MIN_BARS_AGREEMENT:
         says = "the frame of the order bars shows no bars"
-        return [Witness(name, False, agrees, MIN_BARS_AGREEMENT, (position,), says)]
+        return [Witness(name, False, here, MIN_BARS_AGREEMENT, (position,), says)]
+    if other < max(MIN_BARS_AGREEMENT, here + BARS_GAIN):
+        return [
+            Witness(
+                name, True, here, MIN_BARS_AGREEMENT, says=f"{here:.0%} agree with the fringes, no other place better"
+            )
+        ]
     frames = tuple(sorted({position, *(p for fit in fits for p in fit.positions)}))
-    says = f"{agrees:.0%} of pixels agree with the order bars along {axis}: all sets are rotated or reversed alike"
-    return [Witness(name, False, agrees, MIN_BARS_AGREEMENT, frames, says, whole=True)]
+    says = (
+        f"{here:.0%} of pixels agree with the order bars along {axis} where the fringes put them, {other:.0%} "
+        f"{other_at}: all sets are rotated or reversed alike"
+    )
+    return [Witness(name, False, here, MIN_BARS_AGREEMENT, frames, says, whole=True)]
+
+
+def _trusted(
+    scene: Scene, fits: Sequence[Fit], ladder: Ladder, cycles: NDArray[np.float64], centre: float, b: Array
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Field fractions (P,) from the highest rung that is surely unwrapped, and their 1-sigma."""
+    variances = np.array([2 / fit.fringe_set.shifts for fit in fits])
+    vectors = np.abs(_agreement(ladder, cycles, centre))
+    rung = 0
+    while rung < len(vectors) and vectors[rung] > 0.8:
+        rung += 1
+    part = Ladder(ladder.combinations[: rung + 1], ladder.frequencies[: rung + 1], ladder.errors[:rung], False)
+    fraction, _ = climb(part, cycles, centre)
+    weight = float(np.sqrt(np.sum(ladder.combinations[rung] ** 2 * variances))) / (2 * np.pi)
+    return fraction, scene.noise / b * weight / ladder.frequencies[rung]
+
+
+def _best_places(bar: NDArray[np.float64], light: NDArray[np.bool_]) -> tuple[float, float, str]:
+    """Agreement of the bars' light with the places that the fringes give, there and elsewhere.
+
+    Returns (best agreement nearby, best elsewhere, where in words). Nearby is within `NEARBY`:
+    response errors of few shifts bend positions by as much. Edges, where blur decides, count little: they are few.
+    """
+    stride = max(1, bar.size // 3000)
+    bar, light = bar[::stride], light[::stride]
+    near, far, far_at = -1.0, -1.0, ""
+    for mirrored in (False, True):
+        base = BAR_COUNT - bar if mirrored else bar
+        for offset in np.arange(0, BAR_COUNT, 0.25):
+            moved = min(offset, BAR_COUNT - offset)
+            place = np.floor((base + offset) % BAR_COUNT)
+            agrees = float(np.mean((bar_light(place, BAR_COUNT) > 0.5) == light))
+            if not mirrored and moved <= NEARBY:
+                near = max(near, agrees)
+            elif agrees > far:
+                far = agrees
+                far_at = f"{'mirrored and ' if mirrored else ''}{moved / BAR_COUNT:.0%} of the field away"
+    return near, far, far_at
