@@ -31,7 +31,6 @@ _UsageError: Any = typer.BadParameter.__mro__[1]
 app = typer.Typer(
     name="fringed",
     help="Structured-light 3-D scanner: projector, camera and trigger board in step, point clouds in millimetres.",
-    no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -52,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     # Both belong to the whole program: they hold wherever they stand.
     debug, as_json = "--debug" in words, "--json" in words
-    words = [word for word in words if word != "--debug"]
+    words = [word for word in words if word != "--debug"] or ["--help"]
     previous = signal.signal(signal.SIGTERM, _terminated)
     try:
         return _flushed(_run(words, as_json))
@@ -80,8 +79,8 @@ def _run(words: list[str], as_json: bool) -> int:
         print(f"fringed {metadata.version('fringed')}")
         return 0
     try:
-        status = app(words, standalone_mode=False)
-        return int(status or 0)
+        status = int(app(words, prog_name="fringed", standalone_mode=False) or 0)
+        return _interrupted(as_json) if status == INTERRUPTED else status  # newer typers return it, older ones raise
     except ScannerError as error:
         print_error(str(error), error.hint)
         if as_json:
@@ -96,10 +95,14 @@ def _run(words: list[str], as_json: bool) -> int:
             print_json({"error": {"code": WRONG_USAGE, "message": message, "class": "UsageError"}})
         return WRONG_USAGE
     except (KeyboardInterrupt, typer.Abort):
-        print_error("interrupted")
-        if as_json:
-            print_json({"error": {"code": INTERRUPTED, "message": "interrupted", "class": "Interrupted"}})
-        return INTERRUPTED
+        return _interrupted(as_json)
+
+
+def _interrupted(as_json: bool) -> int:
+    print_error("interrupted")
+    if as_json:
+        print_json({"error": {"code": INTERRUPTED, "message": "interrupted", "class": "Interrupted"}})
+    return INTERRUPTED
 
 
 def _flushed(status: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from pathlib import Path
 from typing import Annotated
@@ -67,6 +68,7 @@ def decode(
             made = reconstruct(opened, lens_file, options, lines.stage)
             lines.stage("writing files")
             names = made.save(folder)
+            report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
         except BaseException:
             if not existed and not any(folder.iterdir()):
                 folder.rmdir()
@@ -76,7 +78,7 @@ def decode(
         print_error("no calibration: values are decoded, but no points", "--calibration FILE", label="warning")
     if as_json:
         files = [str(folder / name) for name in names]
-        print_json({"folder": str(folder), "seconds": round(seconds, 3), "files": files, "report": made.report})
+        print_json({"folder": str(folder), "seconds": round(seconds, 3), "files": files, "report": report})
     else:
-        print_summary(folder, made.report, seconds)
+        print_summary(folder, report, seconds)
     return 0

@@ -1,0 +1,383 @@
+"""The command line: exit statuses, what goes to which stream, and what bad input gets."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import typer
+
+from scanner.patterns import PatternSequence, ProjectorSize
+from scanner.scan import load_scan
+from service import cli
+from service.commands import devices
+
+FRINGED = (sys.executable, "-c", "import sys; from service.cli import main; sys.exit(main())")
+COMMANDS = ("scan", "decode", "audit", "patterns", "devices", "check-config", "daemon", "worker", "status")
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Run a command in `tmp_path`: (status, standard output, standard error)."""
+    monkeypatch.chdir(tmp_path)
+
+    def runs(*words: Any) -> tuple[int, str, str]:
+        capsys.readouterr()
+        status = cli.main([str(word) for word in words])
+        captured = capsys.readouterr()
+        assert "Traceback" not in captured.err
+        assert "error: unexpected" not in captured.err, captured.err
+        return status, captured.out, captured.err
+
+    return runs
+
+
+CAMERA = {"width": 160, "height": 128, "bits": 8}
+
+
+def capture_of(folder: Path, **changes: Any) -> Path:
+    """A capture made elsewhere from written patterns: the camera sees the projector pixel by pixel, and dark around."""
+    content = json.loads((folder / "pattern.json").read_text())
+    capture = {
+        "format": "fringed-capture",
+        "version": 1,
+        "projector": content["projector"],
+        "camera": CAMERA,
+        "pattern": content["pattern"],
+        "frames": [f"seen-{name}" for name in content["images"]],
+        **changes,
+    }
+    for name in content["images"]:
+        image = cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
+        seen = np.zeros((CAMERA["height"], CAMERA["width"]), np.uint8)
+        seen[: image.shape[0], : image.shape[1]] = image
+        if not changes:
+            cv2.imwrite(str(folder / f"seen-{name}"), seen)
+    (folder / "capture.json").write_text(json.dumps(capture))
+    return folder
+
+
+# --- streams and statuses -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_examples(command: str, run: Run) -> None:
+    status, out, err = run(command, "--help")
+    assert (status, err) == (0, "")
+    assert "Examples:" in out
+    assert f"  fringed {command}" in out
+
+
+def test_version_and_bare_call(run: Run) -> None:
+    assert run("--version")[:2] == (0, "fringed 0.1.0\n")
+    status, out, _ = run()
+    assert status == 0
+    assert "check-config" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["scna"], "scna"),
+        (["scan", "--colour"], "--colour"),
+        (["scan", "--method", "laser"], "laser"),
+        (["scan", "--rig", "simulated", "--connect", "ipc:///x"], "exclude each other"),
+        (["scan", "--exposure", "long"], "expected auto or microseconds"),
+        (["scan", "--exposure", "-3"], "1 .. 10000000"),
+        (["scan", "--frequencies", "1,x"], "--frequencies"),
+        (["scan", "--frequencies", "1,0"], "positive"),
+        (["scan", "--shifts", "4.5"], "whole numbers"),
+        (["scan", "--frequencies", "1,8", "--shifts", "4,4,4"], "3 numbers for 2 frequencies"),
+        (["scan", "--carriers", "5,6"], "says nothing to the method pmp"),
+        (["scan", "--method", "mcp", "--bits", "3"], "needs --carriers"),
+        (["scan", "--method", "mcp", "--axis", "xy"], "--axis"),
+        (["scan", "--depth", "500:400"], "smaller first"),
+        (["scan", "--depth", "near"], "depth must be"),
+        (["scan", "--box", "1:2"], "box must be"),
+        (["scan", "--min-confidence", "1.5"], "--min-confidence"),
+        (["scan", "--repeat", "0"], "--repeat"),
+        (["decode"], "CAPTURE"),
+        (["audit", "x", "-o", "timing.pdf"], ".svg or .png"),
+        (["patterns", "pmp"], "output"),
+        (["patterns", "pmp", "-o", "x", "--size", "12"], "WIDTHxHEIGHT"),
+        (["patterns", "pmp", "-o", "x", "--size", "64x64", "--frequencies", "1,60"], "period"),
+        (["worker"], "--connect"),
+    ],
+)
+def test_wrong_usage_is_2_and_says_what(words: list[str], said: str, run: Run, tmp_path: Path) -> None:
+    status, out, err = run(*words)
+    assert (status, out) == (2, "")
+    assert said in err
+    assert "--help" in err
+    status, out, _ = run(*words, "--json")
+    assert status == 2
+    assert json.loads(out)["error"]["code"] == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_daemon_says_how_to_start_one(run: Run, tmp_path: Path) -> None:
+    status, out, err = run("status", "--connect", f"ipc://{tmp_path}/none.ipc")
+    assert (status, out) == (1, "")
+    assert "fringed daemon" in err
+    status, out, _ = run("scan", "--connect", f"ipc://{tmp_path}/none.ipc", "--json")
+    assert status == 1
+    assert json.loads(out)["error"]["class"] == "Unreachable"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("debug", [False, True])
+def test_a_bug_shows_one_line_and_where_the_rest_is(
+    debug: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    said: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(cli, "print_error", lambda *words: said.append(words))
+    monkeypatch.setattr(cli, "_run", lambda words, as_json: [].pop())
+    assert cli.main(["devices", *(["--debug"] if debug else [])]) == 1
+    assert said[0][0] == "unexpected IndexError: pop from empty list"
+    logs = list(tmp_path.glob("fringed-error-*.log"))
+    assert [("Traceback" in log.read_text()) for log in logs] == ([] if debug else [True])
+
+
+@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), 130), (typer.Abort(), 130)])
+def test_an_interrupted_command_is_130(
+    error: BaseException, status: int, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr("drivers.registry.discover", interrupted)
+    assert run("devices")[0] == status
+    got, out, _ = run("devices", "--json")
+    assert (got, json.loads(out)["error"]["message"]) == (status, "interrupted")
+
+
+def test_a_closed_pipe_is_no_error() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as closed:
+        ran = subprocess.run(
+            [*FRINGED, "devices", "--json"], stdout=closed, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert (ran.returncode, ran.stderr) == (1, "")
+
+
+def test_the_command_line_starts_without_array_libraries() -> None:
+    heavy = "import sys, service.cli; print(sorted({'numpy', 'numba', 'cv2', 'zmq', 'pydantic'} & set(sys.modules)))"
+    ran = subprocess.run([sys.executable, "-c", heavy], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == "[]"
+
+
+def test_shell_completion_is_offered() -> None:
+    ran = subprocess.run(
+        [*FRINGED, "--show-completion", "bash"], capture_output=True, text=True, check=True, env={**os.environ}
+    )
+    assert "complete" in ran.stdout
+
+
+# --- devices and rig files ----------------------------------------------------------------------------------------
+
+
+def test_devices_lists_the_simulated_rigs(run: Run) -> None:
+    status, out, err = run("devices", "--json")
+    found = json.loads(out)["devices"]
+    assert (status, err) == (0, "")
+    assert {"camera", "projector"} <= {device["kind"] for device in found if device["driver"] == "simulated"}
+    assert devices.devices.__doc__
+    assert "simulated" in run("devices")[1]
+
+
+def test_check_config_says_what_a_rig_file_means_or_all_that_is_wrong(run: Run, tmp_path: Path) -> None:
+    rig = tmp_path / "rig.toml"
+    rig.write_text('camera.driver = "simulated"\nprojector.driver = "simulated"\n')
+    status, out, err = run("check-config", rig)
+    assert (status, err) == (0, "")
+    assert "auto: test shots" in out
+    rig.write_text('camera.driver = "simulated"\ncamera.divice = 3\nprojector.dwell = 0\n')
+    status, out, err = run("check-config", rig)
+    assert (status, out) == (1, "")
+    assert f"{rig}:2: camera.divice: unknown key; did you mean 'device'?" in err
+    assert "projector.driver: is missing" in err
+    assert "projector.dwell = 0: expected refreshes" in err
+    status, out, _ = run("check-config", rig, "--json")
+    assert (status, [problem["line"] for problem in json.loads(out)["problems"]]) == (1, [2, 3, 3])
+
+
+def test_check_config_opens_the_calibration(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "broken.json").write_text("{")
+    (tmp_path / "rig.toml").write_text(
+        'rig.calibration = "broken.json"\ncamera.driver = "simulated"\nprojector.driver = "simulated"\n'
+    )
+    status, _, err = run("check-config", "rig.toml")
+    assert status == 1
+    assert "broken.json" in err
+
+
+# --- patterns -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["pmp", "--frequencies", "1,4,16.5", "--shifts", "3", "--axis", "xy"],
+        ["mcp", "--size", "1152x864"],
+        ["mcp", "--size", "640x480", "--carriers", "40,70,100", "--axis", "x", "--levels", "composite"],
+        ["gray", "--bits", "5"],
+        ["pmp", "--bracketed", "--gamma", "2.2"],
+    ],
+)
+def test_patterns_are_what_their_description_says(words: list[str], run: Run, tmp_path: Path) -> None:
+    size = [] if "--size" in words else ["--size", "96x64"]
+    status, out, _ = run("patterns", *words, *size, "-o", "images", "--json")
+    assert status == 0
+    content = json.loads((tmp_path / "images" / "pattern.json").read_text())
+    assert {key: json.loads(out)[key] for key in content} == content
+    assert (content["format"], content["version"]) == ("fringed-pattern", 1)
+    projector = ProjectorSize(**content["projector"])
+    sequence = PatternSequence.from_description(projector, content["pattern"])
+    assert len(content["images"]) == len(sequence)
+    for position, name in enumerate(content["images"]):
+        image = cv2.imread(str(tmp_path / "images" / name), cv2.IMREAD_UNCHANGED)
+        assert image.dtype == np.uint8
+        np.testing.assert_array_equal(image, sequence.image(position))
+    assert bool(content["pattern"]["sentinels"]) == ("--bracketed" in words)
+
+
+def test_an_output_folder_that_is_not_empty_is_refused(run: Run, tmp_path: Path) -> None:
+    assert run("patterns", "gray", "--size", "8x8", "-o", "images")[0] == 0
+    before = sorted(path.stat().st_mtime_ns for path in (tmp_path / "images").iterdir())
+    status, _, err = run("patterns", "gray", "--size", "8x8", "-o", "images")
+    assert status == 1
+    assert "--force" in err
+    assert sorted(path.stat().st_mtime_ns for path in (tmp_path / "images").iterdir()) == before
+    assert run("patterns", "gray", "--size", "8x8", "-o", "images", "--force")[0] == 0
+    (tmp_path / "file").touch()
+    for place in ("file", "file/below"):
+        status, _, err = run("patterns", "gray", "--size", "8x8", "-o", place)
+        assert status == 1
+        assert "file" in err
+
+
+# --- decode and audit ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def capture(run: Run, tmp_path: Path) -> Path:
+    assert run("patterns", "pmp", "--size", "96x64", "--frequencies", "1,4,16", "--shifts", "4", "-o", "seen")[0] == 0
+    return capture_of(tmp_path / "seen")
+
+
+def test_patterns_seen_pixel_by_pixel_decode_to_their_rows(run: Run, capture: Path) -> None:
+    status, out, err = run("decode", capture, "--json")
+    assert status == 0
+    assert "no calibration" in err
+    result = json.loads(out)
+    assert result["folder"] == str(capture / "scan")
+    assert set(result["report"]["timings"]) >= {"write scan.npz"}
+    rows = load_scan(capture / "scan").rows
+    assert rows is not None
+    seen = rows[:64, :96]
+    assert np.isfinite(seen).mean() > 0.9
+    assert np.nanmax(np.abs(seen - np.arange(64, dtype=np.float32)[:, None])) < 0.1
+    status, out, _ = run("decode", capture / "capture.json", "-o", "elsewhere")
+    assert status == 0
+    assert "elsewhere/preview.png" in out
+    status, _, err = run("decode", capture)
+    assert status == 1
+    assert "not empty" in err
+
+
+def test_audit_of_a_capture_without_stamps_proves_nothing(run: Run, capture: Path, tmp_path: Path) -> None:
+    status, out, _ = run("audit", capture, "--json")
+    assert (status, json.loads(out)["passed"]) == (0, True)
+    assert json.loads(out)["verdicts"] == {"unproved": 12}
+    status, out, _ = run("audit", capture, "-o", "timing.svg")
+    assert status in (0, 1)
+    assert (tmp_path / "timing.svg").exists() == (status == 0)
+
+
+def damage_image(folder: Path) -> None:
+    (folder / "seen-003.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+
+
+def wrong_size(folder: Path) -> None:
+    cv2.imwrite(str(folder / "seen-003.png"), np.zeros((127, 160), np.uint8))
+
+
+def change(**members: Any) -> Callable[[Path], Any]:
+    return lambda folder: capture_of(folder, **members)
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [
+        (shutil.rmtree, "cannot read"),
+        (lambda folder: (folder / "seen-003.png").unlink(), "003.png"),
+        (damage_image, "003.png"),
+        (wrong_size, "003.png"),
+        (lambda folder: (folder / "capture.json").write_text("{"), "not JSON"),
+        (change(format="something"), "fringed-capture"),
+        (change(version=2), "version 2"),
+        (change(frames=["000.png"]), "1 frames listed, the pattern has 12"),
+        (change(frames=["../000.png"] * 12), "folder"),
+        (change(pattern={"method": "laser"}), "laser"),
+        (change(pattern={"method": "pmp", "axes": ["y"], "frequencies": [1], "shifts": [2]}), "three shifts"),
+        (change(calibration="lost.json"), "lost.json"),
+        (change(calibration="../out.json"), "out.json"),
+    ],
+)
+def test_bad_captures_are_refused_and_leave_nothing(
+    harm: Callable[[Path], Any], said: str, run: Run, capture: Path, tmp_path: Path
+) -> None:
+    harm(capture)
+    status, out, err = run("decode", capture, "-o", "out")
+    assert (status, out) == (1, "")
+    assert said in err
+    assert not (tmp_path / "out").exists()
+
+
+def calibration(**changes: Any) -> dict[str, Any]:
+    lens = {"size": [160, 128], "matrix": [[100, 0, 47.5], [0, 100, 31.5], [0, 0, 1]], "distortion": [0, 0, 0, 0, 0]}
+    turned = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    return {
+        "format": "fringed-calibration",
+        "version": 1,
+        "camera": lens,
+        "projector": lens,
+        "rotation": turned,
+        "translation": [0, 50, 0],
+        **changes,
+    }
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"camera": {**calibration()["camera"], "size": [640, 480]}},
+        {"camera": {**calibration()["camera"], "matrix": [[0, 0, 0], [0, 0, 0], [0, 0, 1]]}},
+        {"rotation": [[float("nan"), 0, 0], [0, 1, 0], [0, 0, 1]]},
+        {"rotation": [[1, 0, 0], [1, 0, 0], [0, 0, 1]]},
+        {"version": 2},
+        {"translation": None},
+    ],
+)
+def test_bad_calibrations_are_refused(changes: dict[str, Any], run: Run, capture: Path, tmp_path: Path) -> None:
+    good = tmp_path / "good.json"
+    good.write_text(json.dumps(calibration()))
+    assert run("decode", capture, "--calibration", good, "-o", "good")[0] == 0
+    bad = tmp_path / "bad.json"
+    bad.write_text(json.dumps(calibration(**changes)))
+    status, _, err = run("decode", capture, "--calibration", bad, "-o", "out")
+    assert status == 1
+    assert err.startswith("opening") or "error:" in err
+    assert not (tmp_path / "out").exists()
