@@ -4,6 +4,9 @@
 """
 
 from scanner.sequencer.audit import CaptureCheck, check_capture
+from scanner.sequencer.exposure import ExposureChoice
+from scanner.sequencer.exposure import auto as auto_exposure
+from scanner.sequencer.latency import measure as measure_latency
 from scanner.sequencer.plan import Mode, Plan, Rig, light_unit_ns, plan
 from scanner.sequencer.run import Acquisition, FinishReason, FrameSink, acquire
 from scanner.sequencer.verify import FrameVerdict, verify
@@ -12,6 +15,7 @@ from scanner.sequencer.witness import Witness, Witnesses, witness
 __all__ = [
     "Acquisition",
     "CaptureCheck",
+    "ExposureChoice",
     "FinishReason",
     "FrameSink",
     "FrameVerdict",
@@ -21,8 +25,10 @@ __all__ = [
     "Witness",
     "Witnesses",
     "acquire",
+    "auto_exposure",
     "check_capture",
     "light_unit_ns",
+    "measure_latency",
     "plan",
     "verify",
     "witness",

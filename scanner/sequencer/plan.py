@@ -326,7 +326,7 @@ def _exposure(
     else:
         count = max(1, round(wanted / unit))
         exposure = count * unit
-        reason = f"{count} {name}{'s' if count > 1 else ''} of {_ms(unit)}"
+        reason = f"{count} x one {name} of {_ms(unit)}"
         if asked is not None and abs(exposure - asked) > camera.exposure_step_ns:
             reason += f", rounded from {_ms(asked)}: a grey is whole only over a whole {name}"
     step = max(1, camera.exposure_step_ns)
