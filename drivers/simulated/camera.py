@@ -107,6 +107,7 @@ class SimulatedCamera:
         self._numbers = 0
         self._delivered = 0
         self._ring: list[Pixels] = []
+        self._ring_shows: list[float] = []
         self._buffers: list[Pixels] = []
         self._forget_shots()
         _ = world.view  # cast now: opening a camera may take a second, its first frame may not
@@ -345,11 +346,12 @@ class SimulatedCamera:
         return np.empty((height, width), dtype=np.uint16)
 
     def _fill_ring(self) -> None:
-        """Render the ring's frames, of what shines now."""
-        if len(self._ring) == self._options.ring:
-            return
+        """Render the ring's frames, of what shone during the last exposure's time, unless that is what they show."""
         start = self._clock.now_ns() - self._exposure_ns
-        self._ring = []
+        shows = [segment.on_ns for segment in self._world.timeline.between(start, start + self._exposure_ns)]
+        if len(self._ring) == self._options.ring and shows == self._ring_shows:
+            return
+        self._ring, self._ring_shows = [], shows
         for number in range(self._options.ring):
             frame = self._empty_frame()
             self._render(_Window(start, self._exposure_ns, number), frame)
@@ -380,7 +382,7 @@ class SimulatedCamera:
     @property
     def _gap_ns(self) -> int:
         gap = self._options.min_gap_us
-        return self._readout_ns + 100_000 if gap is None else round(1e3 * gap)
+        return self._readout_ns if gap is None else round(1e3 * gap)
 
     @property
     def _period_ns(self) -> int:

@@ -45,7 +45,7 @@ class CameraOptions:
     shutter: str = field(default="global", metadata={"choices": ("global", "rolling")})
     readout_us: float = field(default=5000.0, metadata={"low": 10.0, "high": 1e6})
     min_gap_us: float | None = field(default=None, metadata={"low": 0.0, "high": 1e6})
-    """end of one exposure to the start of the next; None: readout + 100 us (no overlap)"""
+    """end of one exposure to the start of the next; None: readout_us (a frame that is there leaves an idle camera)"""
     trigger_latency_us: float = field(default=40.0, metadata={"low": 1.0, "high": 1e5})
     """declared as this +- 25 %; the true one varies within"""
     counts_triggers: bool = True
