@@ -1,0 +1,348 @@
+"""The messages between a client and the daemon, as types and bytes: JSON-RPC 2.0 members in MessagePack.
+
+No socket is opened here; `scanner.session` holds a client's side of the conversation, `scanner.stream` the messages
+between daemon and worker. The specification for other languages is docs/reference/protocol.md; its bytes are made
+from these types.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, TypeVar
+
+import msgspec
+from msgspec import UNSET, Struct, UnsetType
+
+from scanner.errors import ProtocolError, ScannerError, from_data
+
+PROTOCOL = (1, 0)
+"""Major and minor version: another major is refused, another minor is not."""
+
+DEFAULT_ENDPOINT = "ipc:///run/fringed/control.ipc"
+
+MAX_REQUEST_BYTES = 1 << 20
+"""Larger requests are answered with an error."""
+
+MAX_FETCH_BYTES = 4 << 20
+"""Most bytes of a file in one answer."""
+
+MAX_MESSAGE_BYTES = 8 << 20
+"""Larger messages are not received at all: ZeroMQ drops the connection (ZMQ_MAXMSGSIZE)."""
+
+TERMINAL_STATES = frozenset({"done", "failed", "cancelled"})
+"""States that a job does not leave."""
+
+WELCOME = b"welcome"
+"""What the events socket sends to a new subscriber once its subscription counts."""
+
+JSONRPC_CODES = {"malformed": -32700, "invalid_request": -32600, "unknown_method": -32601, "invalid_params": -32602}
+"""Faults that JSON-RPC 2.0 numbers itself; every other error has its class's own code."""
+
+
+class Refused(ProtocolError):
+    """A message was understood as far as its fault, and refused. `reason` is a word for programs."""
+
+    def __init__(self, message: str, *, reason: str, hint: str | None = None) -> None:
+        super().__init__(message, hint=hint)
+        self.reason = reason
+
+    def data(self) -> dict[str, Any]:
+        """The error's details, with the reason."""
+        return {**super().data(), "class": ProtocolError.__name__, "reason": self.reason}
+
+
+# --- envelopes ----------------------------------------------------------------------------------------------------
+
+
+class Request(Struct, frozen=True, kw_only=True):
+    """A call. `id` only correlates: it is chosen by the client and comes back with the answer."""
+
+    jsonrpc: Literal["2.0"] = "2.0"
+    id: int | str
+    method: str
+    params: dict[str, Any] = {}
+
+
+class ErrorBody(Struct, frozen=True):
+    """An error: code, message for people, and data {class, device, hint, ...} for programs."""
+
+    code: int
+    message: str
+    data: dict[str, Any] = {}
+
+
+class Response(Struct, frozen=True, kw_only=True):
+    """The answer to a call: `result` or `error`. `id` is null where the call's own could not be read."""
+
+    jsonrpc: Literal["2.0"] = "2.0"
+    id: int | str | None
+    result: Any = UNSET
+    error: ErrorBody | UnsetType = UNSET
+
+
+class Event(Struct, frozen=True):
+    """Something that happened. Numbered from 1 since the daemon started, without gaps."""
+
+    number: int
+    kind: str
+    job: str | None = None
+    fields: dict[str, Any] = {}
+
+
+class Notification(Struct, frozen=True, kw_only=True):
+    """An event on the events socket, as a JSON-RPC notification."""
+
+    jsonrpc: Literal["2.0"] = "2.0"
+    method: Literal["event"] = "event"
+    params: Event
+
+
+class PreviewHeader(Struct, frozen=True, kw_only=True):
+    """Header of a preview or live message. Numbered, so that dropped ones are counted."""
+
+    number: int
+    width: int
+    height: int
+    dtype: Literal["uint8", "uint16"]
+    t_ns: int
+    stride: int = 1
+    """camera pixels per preview pixel"""
+
+
+# --- parameters ---------------------------------------------------------------------------------------------------
+
+
+class Hello(Struct, frozen=True, forbid_unknown_fields=True):
+    """First call of every connection."""
+
+    protocol: tuple[int, int]
+    client: str = ""
+
+
+class Nothing(Struct, frozen=True, forbid_unknown_fields=True):
+    """No parameters."""
+
+
+class FilterParams(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Which points a cloud leaves out. What is not given keeps the daemon's default."""
+
+    edges: bool | None = None
+    max_angle_deg: float | None = None
+    min_fragment: int | None = None
+    depth: tuple[float, float] | None = None
+    box: tuple[float, float, float, float, float, float] | None = None
+    min_confidence: float | None = None
+
+
+class ScanStart(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A scan to make. Everything but `job_id` has a default."""
+
+    job_id: str
+    method: str = "pmp"
+    pattern: dict[str, Any] | None = None
+    exposure: float | Literal["auto"] | None = None
+    """microseconds; "auto" measures; None: what the rig file says"""
+    decoder: str = "default"
+    filters: FilterParams = FilterParams()
+    compare_truth: bool = False
+    repeat: int = 1
+
+
+class JobRef(Struct, frozen=True, forbid_unknown_fields=True):
+    """One job, by its id."""
+
+    id: str
+
+
+class Fetch(Struct, frozen=True, forbid_unknown_fields=True):
+    """A piece of one of a scan's files, by the name that `scan.result` listed."""
+
+    id: str
+    name: str
+    offset: int = 0
+    length: int = MAX_FETCH_BYTES
+
+
+class PreviewStart(Struct, frozen=True, forbid_unknown_fields=True):
+    """A preview: pictures a second, and the greatest width to send, px."""
+
+    rate_hz: float = 10.0
+    max_width: int = 480
+
+
+class FileEntry(Struct, frozen=True):
+    """One file of a scan."""
+
+    name: str
+    bytes: int
+    sha256: str
+
+
+# --- bytes --------------------------------------------------------------------------------------------------------
+
+_Params = TypeVar("_Params", bound=Struct)
+
+_encoder = msgspec.msgpack.Encoder()
+_requests = msgspec.msgpack.Decoder(Request)
+_responses = msgspec.msgpack.Decoder(Response)
+_notifications = msgspec.msgpack.Decoder(Notification)
+_headers = msgspec.msgpack.Decoder(PreviewHeader)
+
+
+def encode(message: Struct) -> bytes:
+    """A message's bytes.
+
+    Raises:
+        ProtocolError: it holds something that MessagePack has no form for.
+    """
+    try:
+        return _encoder.encode(message)
+    except (TypeError, OverflowError, RecursionError) as error:
+        raise ProtocolError(f"a message cannot be encoded: {error}") from error
+
+
+def encode_request(request: Request) -> bytes:
+    """A call's bytes.
+
+    Raises:
+        Refused: longer than any daemon takes.
+    """
+    data = encode(request)
+    if len(data) > MAX_REQUEST_BYTES:
+        raise Refused(
+            f"{request.method}: a request of {len(data)} bytes is longer than the {MAX_REQUEST_BYTES} a daemon takes",
+            reason="too_large",
+        )
+    return data
+
+
+def decode_request(data: bytes) -> Request:
+    """Read a call.
+
+    Raises:
+        Refused: too long, not MessagePack, or not a JSON-RPC 2.0 request.
+    """
+    if len(data) > MAX_REQUEST_BYTES:
+        raise Refused(
+            f"a request of {len(data)} bytes, {MAX_REQUEST_BYTES} are taken",
+            reason="too_large",
+            hint="see hello's limits",
+        )
+    try:
+        return _requests.decode(data)
+    except msgspec.ValidationError as error:
+        raise Refused(f"not a JSON-RPC 2.0 request: {error}", reason="invalid_request") from error
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise Refused(f"not MessagePack: {error}", reason="malformed") from error
+
+
+def request_id(data: bytes) -> int | str | None:
+    """The id of a request that could not be read whole, if at least that can be."""
+    try:
+        content = msgspec.msgpack.decode(data[:MAX_REQUEST_BYTES])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None
+    found = content.get("id") if isinstance(content, dict) else None
+    return found if isinstance(found, int | str) and not isinstance(found, bool) else None
+
+
+def decode_response(data: bytes) -> Response:
+    """Read an answer.
+
+    Raises:
+        ProtocolError: it is none.
+    """
+    try:
+        return _responses.decode(data)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise ProtocolError(f"the daemon's answer is not a JSON-RPC response: {error}") from error
+
+
+def decode_event(data: bytes) -> Event:
+    """Read a message of the events socket.
+
+    Raises:
+        ProtocolError: it is no event.
+    """
+    try:
+        return _notifications.decode(data).params
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise ProtocolError(f"not an event: {error}") from error
+
+
+def params_as(kind: type[_Params], request: Request) -> _Params:
+    """A call's parameters as their type.
+
+    Raises:
+        Refused: one is missing, unknown or of the wrong type, named.
+    """
+    try:
+        return msgspec.convert(request.params, kind)
+    except msgspec.ValidationError as error:
+        raise Refused(f"{request.method}: {error}", reason="invalid_params") from error
+
+
+def error_body(error: ScannerError) -> ErrorBody:
+    """An error as it crosses the wire."""
+    reason = getattr(error, "reason", None)
+    return ErrorBody(JSONRPC_CODES.get(str(reason), error.code), error.message, error.data())
+
+
+def error_from_body(body: ErrorBody) -> ScannerError:
+    """The error that crossed the wire, of its class, with its hint."""
+    reason = body.data.get("reason")
+    if body.data.get("class") == ProtocolError.__name__ and isinstance(reason, str):
+        return Refused(body.message, reason=reason, hint=body.data.get("hint"))
+    return from_data(body.message, body.data)
+
+
+def encode_preview(header: PreviewHeader, pixels: bytes | memoryview) -> bytes:
+    """One part: 4-byte little-endian length of the header, header, pixels."""
+    head = _encoder.encode(header)
+    return b"".join((len(head).to_bytes(4, "little"), head, pixels))
+
+
+def decode_preview(data: bytes) -> tuple[PreviewHeader, memoryview]:
+    """Header and pixels, height x width, of a preview message.
+
+    Raises:
+        ProtocolError: it is none, or its length contradicts its header.
+    """
+    view = memoryview(data)
+    length = int.from_bytes(view[:4], "little")
+    try:
+        header = _headers.decode(view[4 : 4 + length])
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise ProtocolError(f"not a preview: {error}") from error
+    pixels = view[4 + length :]
+    if len(pixels) != header.width * header.height * (2 if header.dtype == "uint16" else 1):
+        raise ProtocolError(f"a preview of {header.width} x {header.height} with {len(pixels)} bytes")
+    return header, pixels
+
+
+# --- endpoints ----------------------------------------------------------------------------------------------------
+
+
+def ipc_path(endpoint: str) -> str:
+    """The socket file of a local endpoint.
+
+    Raises:
+        Refused: not ipc, or longer than the system's socket names.
+    """
+    if not endpoint.startswith("ipc://"):
+        raise Refused(
+            f"endpoint {endpoint!r} is not local: only ipc:// is served",
+            reason="endpoint",
+            hint="connections from other machines need CURVE keys, which this version does not have; "
+            "use ipc:// here, or forward the socket through ssh",
+        )
+    path = endpoint.removeprefix("ipc://")
+    if not path.startswith("/") or len(path.encode()) > 100:  # sockaddr_un holds 107, siblings add a few
+        raise Refused(f"endpoint {endpoint!r} needs an absolute path of at most 100 bytes", reason="endpoint")
+    return path
+
+
+def sibling(endpoint: str, name: str) -> str:
+    """The endpoint of another socket of the same daemon: events, preview or worker."""
+    folder, _, file = ipc_path(endpoint).rpartition("/")
+    stem = file.removesuffix(".ipc")
+    return f"ipc://{folder}/{name if stem == 'control' else f'{stem}-{name}'}.ipc"

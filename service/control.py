@@ -1,0 +1,255 @@
+"""The daemon's methods: what each call of a client does. Sockets are `service.daemon`'s."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from scanner.errors import StorageError
+from scanner.wire import (
+    MAX_FETCH_BYTES,
+    MAX_MESSAGE_BYTES,
+    MAX_REQUEST_BYTES,
+    PROTOCOL,
+    Fetch,
+    Hello,
+    JobRef,
+    Nothing,
+    PreviewStart,
+    Refused,
+    Request,
+    ScanStart,
+    params_as,
+)
+from service.devices_link import DevicesLink
+from service.jobs import Job, JobState
+from service.pipe import Preview
+from service.pipeline import MAX_QUEUED, Pipeline
+from service.spool import CAPTURE
+from service.worker_pool import WorkerPool
+
+MAX_CLIENTS = 4096
+"""Connections remembered; one that was forgotten says hello again."""
+
+
+@dataclass(frozen=True)
+class Endpoints:
+    """Where the daemon's sockets are."""
+
+    control: str
+    events: str
+    preview: str
+    worker: str
+
+
+class Control:
+    """Answers calls. `answer` may be awaited by many at once."""
+
+    def __init__(
+        self,
+        name: str,
+        endpoints: Endpoints,
+        pipeline: Pipeline,
+        devices: DevicesLink,
+        workers: WorkerPool,
+        last_event: Callable[[], int],
+        stop: Callable[[], None],
+    ) -> None:
+        self._name = name
+        self._endpoints = endpoints
+        self._pipeline = pipeline
+        self._devices = devices
+        self._workers = workers
+        self._last_event = last_event
+        self._stop = stop
+        self._clients: OrderedDict[bytes, str] = OrderedDict()
+        self._methods: dict[str, Callable[[Request, str], Awaitable[Any]]] = {
+            "status": self._status,
+            "devices.list": self._list_devices,
+            "scan.start": self._start,
+            "scan.status": self._scan_status,
+            "scan.result": self._result,
+            "scan.fetch": self._fetch,
+            "scan.cancel": self._cancel,
+            "scan.list": self._list,
+            "scan.acknowledge": self._acknowledge,
+            "scan.delete": self._delete,
+            "preview.start": self._preview_start,
+            "preview.stop": self._preview_stop,
+            "shutdown": self._shutdown,
+        }
+
+    async def answer(self, identity: bytes, request: Request) -> Any:
+        """A call's result.
+
+        Raises:
+            ScannerError: what the client is told.
+        """
+        if request.method == "hello":
+            return self._hello(identity, request)
+        method = self._methods.get(request.method)
+        if method is None:
+            raise Refused(
+                f"unknown method {request.method!r}",
+                reason="unknown_method",
+                hint=f"methods: hello, {', '.join(self._methods)}",
+            )
+        client = self._clients.get(identity)
+        if client is None:
+            raise Refused(
+                f"{request.method} before hello: this connection is not known",
+                reason="hello_required",
+                hint="say hello first, and again when the daemon was restarted",
+            )
+        return await method(request, client)
+
+    def _hello(self, identity: bytes, request: Request) -> dict[str, Any]:
+        given = params_as(Hello, request)
+        if given.protocol[0] != PROTOCOL[0]:
+            raise Refused(
+                f"the client speaks protocol {list(given.protocol)}, this daemon {list(PROTOCOL)}",
+                reason="protocol_version",
+                hint="install the same version of fringed on both sides",
+            )
+        self._clients[identity] = given.client
+        self._clients.move_to_end(identity)
+        while len(self._clients) > MAX_CLIENTS:
+            self._clients.popitem(last=False)
+        return {
+            "protocol": list(PROTOCOL),
+            "daemon": {"name": self._name, "version": metadata.version("fringed"), "pid": os.getpid()},
+            "features": ["hello", *self._methods],
+            "limits": {
+                "request_bytes": MAX_REQUEST_BYTES,
+                "message_bytes": MAX_MESSAGE_BYTES,
+                "fetch_bytes": MAX_FETCH_BYTES,
+                "queued_scans": MAX_QUEUED,
+            },
+            "endpoints": {
+                "events": self._endpoints.events,
+                "preview": self._endpoints.preview,
+                "live": None,
+                "worker": self._endpoints.worker,
+            },
+        }
+
+    async def _status(self, request: Request, _client: str) -> dict[str, Any]:
+        params_as(Nothing, request)
+        spool = self._pipeline.spool
+        return {
+            "number": self._last_event(),
+            "name": self._name,
+            "devices": self._devices.description,
+            "workers": self._workers.describe(),
+            "waiting_for_worker": self._workers.waiting,
+            "jobs": [job.status() for job in self._pipeline.store.unfinished()],
+            "spool": {
+                "bytes": await asyncio.to_thread(spool.used),
+                "limit_bytes": spool.limits.bytes,
+                "min_free_bytes": spool.limits.min_free_bytes,
+            },
+        }
+
+    async def _list_devices(self, request: Request, _client: str) -> dict[str, Any]:
+        params_as(Nothing, request)
+        return {"devices": await self._devices.discover()}
+
+    async def _start(self, request: Request, client: str) -> dict[str, Any]:
+        job = await self._pipeline.submit(params_as(ScanStart, request), client)
+        return self._with_number(job)
+
+    async def _scan_status(self, request: Request, _client: str) -> dict[str, Any]:
+        return self._with_number(self._job(request))
+
+    async def _result(self, request: Request, _client: str) -> dict[str, Any]:
+        job = self._job(request)
+        if job.deleted and job.state is JobState.DONE:
+            raise StorageError(
+                f"the files of job {job.id} were deleted", hint="scans leave the spool once acknowledged, or by age"
+            )
+        if job.state is JobState.DONE:
+            self._pipeline.spool.lease(job.id)
+        return job.result()
+
+    async def _fetch(self, request: Request, _client: str) -> bytes:
+        given = params_as(Fetch, request)
+        job = self._pipeline.store.get(given.id)
+        entry = next((entry for entry in job.files if entry.name == given.name), None)
+        if entry is None or job.output is None or job.deleted:
+            raise Refused(
+                f"job {job.id} has no file {given.name[:200]!r}", reason="unknown_file", hint="scan.result names them"
+            )
+        if given.offset < 0 or not 0 < given.length <= MAX_FETCH_BYTES:
+            raise Refused(
+                f"scan.fetch: offset {given.offset}, length {given.length}",
+                reason="invalid_params",
+                hint=f"offset 0 or more, length 1 .. {MAX_FETCH_BYTES}",
+            )
+        self._pipeline.spool.lease(job.id)
+        folder = self._pipeline.spool.folder(job.id)
+        inside, _, name = entry.name.rpartition("/")
+        path = (folder / CAPTURE if inside == CAPTURE else folder / job.output) / name
+        return await asyncio.to_thread(_piece, path, given.offset, given.length)
+
+    async def _cancel(self, request: Request, _client: str) -> dict[str, Any]:
+        job = self._job(request)
+        await self._pipeline.cancel(job)
+        return self._with_number(job)
+
+    async def _list(self, request: Request, _client: str) -> dict[str, Any]:
+        params_as(Nothing, request)
+        return {"number": self._last_event(), "scans": [job.status() for job in self._pipeline.store]}
+
+    async def _acknowledge(self, request: Request, _client: str) -> dict[str, Any]:
+        job = self._job(request)
+        await self._pipeline.acknowledge(job)
+        return self._with_number(job)
+
+    async def _delete(self, request: Request, _client: str) -> dict[str, Any]:
+        job = self._job(request)
+        await self._pipeline.delete(job)
+        return self._with_number(job)
+
+    async def _preview_start(self, request: Request, _client: str) -> dict[str, Any]:
+        given = params_as(PreviewStart, request)
+        if not 0 < given.rate_hz <= 60 or not 16 <= given.max_width <= 2048:
+            raise Refused(
+                f"preview.start: rate {given.rate_hz:g} Hz, width {given.max_width}",
+                reason="invalid_params",
+                hint="rate_hz up to 60, max_width 16 .. 2048",
+            )
+        await self._devices.preview(Preview(self._endpoints.preview, given.rate_hz, given.max_width))
+        return {"endpoint": self._endpoints.preview}
+
+    async def _preview_stop(self, request: Request, _client: str) -> dict[str, Any]:
+        params_as(Nothing, request)
+        await self._devices.preview(Preview(self._endpoints.preview, 0.0, 0))
+        return {}
+
+    async def _shutdown(self, request: Request, _client: str) -> Mapping[str, Any]:
+        params_as(Nothing, request)
+        self._stop()
+        return {}
+
+    def _job(self, request: Request) -> Job:
+        return self._pipeline.store.get(params_as(JobRef, request).id)
+
+    def _with_number(self, job: Job) -> dict[str, Any]:
+        return {"number": self._last_event(), **job.status()}
+
+
+def _piece(path: Path, offset: int, length: int) -> bytes:
+    try:
+        with path.open("rb", buffering=0) as file:
+            file.seek(offset)
+            return file.read(length)
+    except OSError as error:
+        raise StorageError(
+            f"{path.name} cannot be read: {error.strerror}", hint="was the spool changed by hand?"
+        ) from error

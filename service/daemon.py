@@ -1,0 +1,298 @@
+"""The daemon: sockets, children and their lives. `python -m service.daemon --config FILE`, or `fringed daemon FILE`.
+
+It imports neither OpenCV nor kernels and never holds a pixel; what it does for clients is in `service.control`, what it
+does with jobs in `service.pipeline`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import fcntl
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import zmq
+import zmq.asyncio
+
+from scanner.errors import ConfigError, ScannerError
+from scanner.storage import storage_errors
+from scanner.stream import SILENCE_S as WORKER_SILENCE_S
+from scanner.wire import (
+    Event,
+    Notification,
+    Refused,
+    Response,
+    decode_request,
+    encode,
+    error_body,
+    ipc_path,
+    request_id,
+    sibling,
+)
+from service.control import Control, Endpoints
+from service.devices_link import SILENCE_S as DEVICES_SILENCE_S
+from service.devices_link import DevicesLink
+from service.jobs import JobStore
+from service.logs import start_logging
+from service.pipeline import Pipeline
+from service.sockets import bound, refuse_taken, send_now
+from service.spool import Limits, Spool
+from service.worker_pool import WorkerPool
+
+if TYPE_CHECKING:
+    from service.config import RigConfig
+
+DEFAULT_STATE = Path("/var/lib/fringed")
+LOCK_S = 5.0
+"""How long the children of a daemon that was killed may take to end."""
+
+_log = logging.getLogger(__name__)
+
+
+class Daemon:
+    """One daemon in one event loop: `async with` has it running, `run` serves until it is stopped."""
+
+    def __init__(
+        self,
+        config: RigConfig,
+        *,
+        state_dir: Path,
+        endpoint: str,
+        devices_silence_s: float = DEVICES_SILENCE_S,
+        worker_silence_s: float = WORKER_SILENCE_S,
+    ) -> None:
+        self._config = config
+        self._state_dir = state_dir
+        self._endpoints = Endpoints(endpoint, *(sibling(endpoint, name) for name in ("events", "preview", "worker")))
+        self._devices_silence_s = devices_silence_s
+        self._worker_silence_s = worker_silence_s
+        self._number = 0
+        self._stopped = asyncio.Event()
+        self._calls: set[asyncio.Task[None]] = set()
+
+    async def run(self, ready: asyncio.Event | None = None) -> None:
+        """Serve until `stop`.
+
+        Raises:
+            ConfigError: another daemon is at work on the same state, or an endpoint makes no sense.
+            StorageError: state or spool cannot be written.
+        """
+        refuse_taken(self._endpoints.control)
+        with _locked(self._state_dir) as lock:
+            store = JobStore(self._state_dir / "jobs")
+            spool = _spool(self._config, self._state_dir)
+            spool.prepare()
+            context = zmq.asyncio.Context()
+            try:
+                await self._serve(context, store, spool, lock, ready)
+            finally:
+                context.destroy(linger=200)
+                for endpoint in vars(self._endpoints).values():
+                    with suppress(FileNotFoundError):
+                        Path(ipc_path(endpoint)).unlink()
+
+    def stop(self) -> None:
+        """End soon: the scan that acquires is cancelled, what is being decoded is kept for the next daemon."""
+        self._stopped.set()
+
+    async def _serve(
+        self, context: zmq.asyncio.Context, store: JobStore, spool: Spool, lock: int, ready: asyncio.Event | None
+    ) -> None:
+        self._control = bound(context, zmq.ROUTER, self._endpoints.control)
+        self._events = bound(context, zmq.XPUB, self._endpoints.events)
+        router = bound(context, zmq.ROUTER, self._endpoints.worker)
+        rig = self._config.model_dump(mode="json")
+        devices = DevicesLink(rig, self.publish, inherit=[lock], silence_s=self._devices_silence_s)
+        command_line = ("--lifeline", "--connect", self._endpoints.control)
+        workers = WorkerPool(router, self.publish, command_line, inherit=[lock], silence_s=self._worker_silence_s)
+        pipeline = Pipeline(store, spool, devices, workers, self.publish)
+        control = Control(
+            self._config.rig.name, self._endpoints, pipeline, devices, workers, lambda: self._number, self.stop
+        )
+        serving = [asyncio.create_task(self._listen(control)), asyncio.create_task(self._drain_subscriptions())]
+        workers.start(self._config.daemon.workers)
+        opening = asyncio.create_task(_open_early(devices))
+        pipeline.start()
+        if ready is not None:
+            ready.set()
+        _log.info("serving %s", self._endpoints.control)
+        try:
+            await self._stopped.wait()
+        finally:
+            _log.info("ending")
+            await pipeline.close()
+            for task in (*serving, opening, *self._calls):
+                task.cancel()
+            await asyncio.gather(*serving, opening, *self._calls, return_exceptions=True)
+            await asyncio.gather(workers.close(), devices.close())
+
+    # --- sockets ------------------------------------------------------------------------------------------------
+
+    def publish(self, kind: str, job: str | None, fields: Mapping[str, Any]) -> None:
+        """Number an event and send it to all who listen; one who is late loses some and sees it by the number."""
+        self._number += 1
+        data = encode(Notification(params=Event(self._number, kind, job, dict(fields))))
+        send_now(self._events, [data])
+
+    async def _listen(self, control: Control) -> None:
+        while True:
+            parts = await self._control.recv_multipart()
+            # A REQ socket puts an empty part between address and message; it gets one back.
+            address = parts[:2] if len(parts) > 2 and not parts[1] else parts[:1]
+            task = asyncio.create_task(self._answer(control, address, parts[len(address) :]))
+            self._calls.add(task)
+            task.add_done_callback(self._calls.discard)
+
+    async def _answer(self, control: Control, address: list[bytes], body: list[bytes]) -> None:
+        number = request_id(body[0]) if len(body) == 1 else None
+        try:
+            request = decode_request(_only_part(body))
+            data = encode(Response(id=request.id, result=await control.answer(address[0], request)))
+        except ScannerError as error:
+            data = encode(Response(id=number, error=error_body(error)))
+        except Exception as error:  # noqa: BLE001  (one call that fails must not end the daemon)
+            _log.exception("a call failed")
+            problem = ScannerError(f"the daemon failed: {type(error).__name__}: {error}", hint="see its log")
+            data = encode(Response(id=number, error=error_body(problem)))
+        self._reply(address, data)
+
+    def _reply(self, address: list[bytes], data: bytes) -> None:
+        # Pieces of files go without another copy: libzmq holds the bytes until they are sent.
+        if not send_now(self._control, [*address, data], copy=len(data) < 1 << 16):
+            _log.info("a client went away before its answer came")
+
+    async def _drain_subscriptions(self) -> None:
+        while True:
+            await self._events.recv()
+
+
+def _only_part(body: list[bytes]) -> bytes:
+    if len(body) != 1:
+        raise Refused(f"a call has one part, not {len(body)}", reason="invalid_request")
+    return body[0]
+
+
+async def _open_early(devices: DevicesLink) -> None:
+    """Devices open while nobody waits for them yet; what fails is told by an event, and again by the first scan."""
+    try:
+        await devices.open()
+    except ScannerError as error:
+        _log.error("devices: %s (%s)", error, error.hint)
+
+
+@contextmanager
+def _locked(state_dir: Path) -> Iterator[int]:
+    """Hold the state folder's lock. Children inherit it: it is free when the last of an earlier daemon is gone."""
+    with storage_errors(state_dir):
+        state_dir.mkdir(mode=0o750, parents=True, exist_ok=True)
+        descriptor = os.open(state_dir / "lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o640)
+    try:
+        deadline = time.monotonic() + LOCK_S
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise ConfigError(
+                        f"another daemon is at work in {state_dir}",
+                        hint="fringed status shows it; two daemons need two state folders and two endpoints",
+                    ) from None
+                time.sleep(0.05)
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _spool(config: RigConfig, state_dir: Path) -> Spool:
+    daemon = config.daemon
+    days = daemon.retention.max_age_days
+    return Spool(
+        Path(daemon.spool) if daemon.spool is not None else state_dir / "spool",
+        Limits(
+            bytes=None if daemon.spool_limit_gb is None else round(daemon.spool_limit_gb * 1e9),
+            min_free_bytes=round(daemon.retention.min_free_gb * 1e9),
+            max_age_s=None if days is None else days * 86400.0,
+        ),
+    )
+
+
+def run_daemon(
+    config: RigConfig, *, state_dir: Path = DEFAULT_STATE, endpoint: str = "", lifeline: bool = False
+) -> None:
+    """Run a daemon until it is told to end: by a client, SIGTERM or SIGINT, or its lifeline.
+
+    Args:
+        config: the rig.
+        state_dir: job records, and the spool where the rig file names none.
+        endpoint: control endpoint; "": the rig file's.
+        lifeline: end when standard input closes, and say "ready" on standard output.
+
+    Raises:
+        ConfigError, StorageError, ProtocolError: it cannot begin.
+    """
+    asyncio.run(_run(config, state_dir, endpoint or config.daemon.endpoint, lifeline))
+
+
+async def _run(config: RigConfig, state_dir: Path, endpoint: str, lifeline: bool) -> None:
+    daemon = Daemon(config, state_dir=state_dir, endpoint=endpoint)
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, daemon.stop)
+    ready = asyncio.Event()
+    telling = asyncio.create_task(_tell_ready(ready)) if lifeline else None
+    if lifeline:
+        loop.add_reader(sys.stdin.fileno(), _read_lifeline, daemon)
+    try:
+        await daemon.run(ready)
+    finally:
+        if lifeline:
+            loop.remove_reader(sys.stdin.fileno())
+        if telling is not None:
+            telling.cancel()
+
+
+def _read_lifeline(daemon: Daemon) -> None:
+    if not os.read(sys.stdin.fileno(), 64):
+        daemon.stop()
+
+
+async def _tell_ready(ready: asyncio.Event) -> None:
+    await ready.wait()
+    print("ready", flush=True)
+
+
+def main() -> int:
+    """The process."""
+    parser = argparse.ArgumentParser(prog="python -m service.daemon")
+    parser.add_argument("--config", required=True, help="a rig file, or simulated[:DEVICE]")
+    parser.add_argument("--state", type=Path, default=DEFAULT_STATE, help="folder of job records")
+    parser.add_argument("--private", type=Path, help="keep sockets, records and spool in this folder")
+    parser.add_argument("--lifeline", action="store_true", help="end when standard input closes")
+    given = parser.parse_args()
+    start_logging("daemon")
+    try:
+        from service.config import load_rig  # noqa: PLC0415  (after logging: its errors are logged)
+
+        config = load_rig(given.config)
+        state, endpoint = given.state, ""
+        if given.private is not None:
+            state, endpoint = given.private, f"ipc://{given.private}/control.ipc"
+            config = config.model_copy(update={"daemon": config.daemon.model_copy(update={"spool": None})})
+        run_daemon(config, state_dir=state, endpoint=endpoint, lifeline=given.lifeline)
+    except ScannerError as error:
+        _log.error("%s%s", error, f" ({error.hint})" if error.hint else "")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,261 @@
+"""The daemon's side of the devices process: starts it, asks for scans, and gives it up when it hangs or dies.
+
+closed --open--> opening --opened--> idle --acquire--> scanning --ended--> idle
+any --process gone, or silent for too long (it is killed)--> closed; the next need opens a fresh one
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from scanner.errors import DeviceBusy, DeviceError, DeviceLost, ProtocolError, ScannerError
+from scanner.wire import ScanStart, error_body, error_from_body
+from service.children import Child
+from service.pipe import (
+    Acquire,
+    Began,
+    CancelAcquire,
+    Command,
+    DeviceFault,
+    Devices,
+    Discover,
+    Ended,
+    Frames,
+    Go,
+    Need,
+    Open,
+    Opened,
+    OpenFailed,
+    Preview,
+    Report,
+    framed,
+    read_report,
+)
+
+OPEN_S = 60.0
+"""Slow to open: a camera on a sleeping bus, a simulated scene whose kernels are compiled first."""
+
+SILENCE_S = 30.0
+"""A scan says something with every frame; exposures last 10 s at most (`service.config`), twice that and a margin."""
+
+DISCOVER_S = 15.0
+_log = logging.getLogger(__name__)
+Publish = Callable[[str, str | None, Mapping[str, Any]], None]
+
+
+class ScanListener(Protocol):
+    """What hears of a scan while it runs."""
+
+    async def need(self, need: Need) -> None:
+        """The scan is planned. Raise StorageError to refuse it."""
+
+    def began(self) -> None:
+        """The capture folder is there."""
+
+    def frames(self, frames: Frames) -> None:
+        """More lines are in frames.jsonl."""
+
+
+class DevicesLink:
+    """One devices process at a time."""
+
+    def __init__(
+        self, rig: Mapping[str, Any], publish: Publish, *, inherit: Sequence[int] = (), silence_s: float = SILENCE_S
+    ) -> None:
+        self._rig = dict(rig)
+        self._publish = publish
+        self._inherit = tuple(inherit)
+        self._silence_s = silence_s
+        self._child: Child | None = None
+        self._reader: asyncio.Task[None] | None = None
+        self._opened: asyncio.Future[Opened] | None = None
+        self._scan: asyncio.Queue[Report | None] | None = None
+        self._numbers = itertools.count(1)
+        self._discoveries: dict[int, asyncio.Future[list[dict[str, Any]]]] = {}
+        self._preview: Preview | None = None
+        self.description: dict[str, Any] | None = None
+        """camera and projector as opened; None while there are none"""
+
+    async def open(self) -> Opened:
+        """Open the devices unless they are.
+
+        Raises:
+            ScannerError: why they cannot be opened.
+        """
+        if self._opened is None:
+            self._opened = asyncio.get_running_loop().create_future()
+            self._opened.add_done_callback(_seen)
+            self._child = await Child.start("service.devices_process", inherit=self._inherit, talks=True)
+            self._reader = asyncio.create_task(self._read(self._child))
+            self._send(Open(self._rig))
+        opened = self._opened
+        try:
+            return await asyncio.wait_for(asyncio.shield(opened), OPEN_S)
+        except TimeoutError:
+            await self._give_up()
+            raise DeviceLost(
+                f"the devices did not open within {OPEN_S:g} s",
+                hint="unplug and plug the camera, look at the log, and try `fringed devices`",
+            ) from None
+
+    async def acquire(self, job: str, folder: Path, params: ScanStart, listener: ScanListener) -> Ended:
+        """Run a scan to its end, which always comes."""
+        try:
+            await self.open()
+        except ScannerError as error:
+            return Ended(job, None, error=error_body(error))
+        self._scan = asyncio.Queue()
+        self._send(Acquire(job, str(folder), params))
+        try:
+            return await self._follow(job, listener)
+        finally:
+            self._scan = None
+
+    def cancel(self, job: str) -> None:
+        """Stop a scan between two frames."""
+        self._send(CancelAcquire(job))
+
+    async def discover(self) -> list[dict[str, Any]]:
+        """The devices that the drivers can see.
+
+        Raises:
+            ScannerError: they cannot be asked now.
+        """
+        await self.open()
+        number = next(self._numbers)
+        found = self._discoveries[number] = asyncio.get_running_loop().create_future()
+        self._send(Discover(number))
+        try:
+            return await asyncio.wait_for(found, DISCOVER_S)
+        except TimeoutError:
+            raise DeviceBusy("the devices are busy with a scan", hint="ask again when it is over") from None
+        finally:
+            self._discoveries.pop(number, None)
+
+    async def preview(self, wanted: Preview) -> None:
+        """Start the preview, or stop it (rate 0).
+
+        Raises:
+            ScannerError: the devices cannot be opened.
+        """
+        self._preview = wanted if wanted.rate_hz > 0 else None
+        if wanted.rate_hz > 0:
+            await self.open()
+        self._send(wanted)
+
+    async def close(self) -> None:
+        """Give the devices back and end the process."""
+        if self._child is not None:
+            await self._child.stop()
+        if self._reader is not None:
+            await asyncio.gather(self._reader, return_exceptions=True)
+
+    async def _follow(self, job: str, listener: ScanListener) -> Ended:
+        lines = 0
+        while True:
+            try:
+                report = await asyncio.wait_for(self._reports().get(), self._silence_s)
+            except TimeoutError:
+                await self._give_up()
+                silent = f"the devices process said nothing for {self._silence_s:g} s and was killed"
+                return self._lost(job, lines, silent)
+            match report:
+                case None:
+                    return self._lost(job, lines, "the devices process died")
+                case Ended():
+                    return report
+                case Need():
+                    try:
+                        await listener.need(report)
+                        self._send(Go(job))
+                    except ScannerError as error:
+                        self._send(CancelAcquire(job))
+                        return await self._refused(job, error)
+                case Began():
+                    listener.began()
+                case Frames():
+                    lines = report.lines
+                    listener.frames(report)
+
+    async def _refused(self, job: str, error: ScannerError) -> Ended:
+        while not isinstance(await self._reports().get(), Ended | None):
+            continue
+        return Ended(job, None, error=error_body(error))
+
+    def _reports(self) -> asyncio.Queue[Report | None]:
+        if self._scan is None:
+            raise AssertionError("no scan runs")
+        return self._scan
+
+    @staticmethod
+    def _lost(job: str, lines: int, what: str) -> Ended:
+        error = DeviceLost(what, hint="look at the log for the cause; the next scan opens the devices again")
+        return Ended(job, "device_lost", lines, error=error_body(error))
+
+    def _send(self, command: Command) -> None:
+        if self._child is not None:
+            self._child.send(framed(command))
+
+    async def _give_up(self) -> None:
+        if self._child is not None:
+            self._child.kill()
+            await self._child.wait()
+        if self._reader is not None:
+            await asyncio.gather(self._reader, return_exceptions=True)
+
+    async def _read(self, child: Child) -> None:
+        try:
+            while (report := await read_report(child.reports)) is not None:
+                self._take(report)
+        except ProtocolError as error:
+            _log.error("%s", error)
+            child.kill()
+        status = await child.wait()
+        self._gone(status)
+
+    def _take(self, report: Report) -> None:
+        match report:
+            case Opened():
+                self.description = {"camera": report.camera, "projector": report.projector}
+                if self._opened is not None and not self._opened.done():
+                    self._opened.set_result(report)
+                self._publish("device.opened", None, self.description)
+                if self._preview is not None:
+                    self._send(self._preview)
+            case OpenFailed(error=error):
+                self._fail_opening(error_from_body(error))
+                self._publish("device.failed", None, {"error": error.message})
+            case DeviceFault(error=error):
+                self._publish("device.lost", None, {"error": error.message})
+            case Devices(number=number, devices=devices):
+                if (waiting := self._discoveries.get(number)) is not None and not waiting.done():
+                    waiting.set_result(devices)
+            case _:
+                if self._scan is not None:
+                    self._scan.put_nowait(report)
+
+    def _gone(self, status: int) -> None:
+        was_open = self.description is not None
+        self.description = None
+        self._fail_opening(DeviceError(f"the devices process ended with status {status}", hint="look at the log"))
+        self._opened = None
+        self._child = None
+        if self._scan is not None:
+            self._scan.put_nowait(None)
+        if was_open and status != 0:
+            self._publish("device.lost", None, {"status": status})
+
+    def _fail_opening(self, error: ScannerError) -> None:
+        if self._opened is not None and not self._opened.done():
+            self._opened.set_exception(error)
+
+
+def _seen(opened: asyncio.Future[Opened]) -> None:
+    """Opening at start has nobody who waits for it: a failure is told by the event, and again by the next scan."""
+    if not opened.cancelled():
+        opened.exception()

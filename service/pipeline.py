@@ -1,0 +1,395 @@
+"""A job's way through the daemon: queue, devices, spool, worker. One scan acquires while the one before decodes.
+
+Each change of state is on disk before it is told. No device and no pixel is touched here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import shutil
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import msgspec
+
+from scanner.errors import ConfigError, ScannerError, StorageError, SyncError
+from scanner.stream import DecodedNote, Progress, Result
+from scanner.wire import ErrorBody, Refused, ScanStart, error_from_body
+from service.devices_link import DevicesLink
+from service.jobs import Job, JobState, JobStore
+from service.pipe import Ended, Frames, Need
+from service.series import Series, capture_state, missing_patterns
+from service.spool import Spool
+from service.worker_pool import WorkerLost, WorkerPool
+
+MAX_QUEUED = 256
+FRAME_EVENT_S = 0.05
+"""Events of captured frames are told at most this often, and for the last frame."""
+
+SWEEP_S = 600.0
+
+_T = TypeVar("_T")
+_log = logging.getLogger(__name__)
+Publish = Callable[[str, str | None, Mapping[str, Any]], None]
+
+
+class Pipeline:
+    """All jobs of one daemon."""
+
+    def __init__(
+        self, store: JobStore, spool: Spool, devices: DevicesLink, workers: WorkerPool, publish: Publish
+    ) -> None:
+        self.store = store
+        self.spool = spool
+        self._devices = devices
+        self._workers = workers
+        self._publish = publish
+        self._queue: deque[Job] = deque()
+        self._queued = asyncio.Event()
+        self._series: dict[str, Series] = {}
+        self._acquiring: Job | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        # One thread: records reach the disk in the order in which they were made.
+        self._disk = ThreadPoolExecutor(1, thread_name_prefix="records")
+
+    def start(self) -> None:
+        """Take up what an earlier daemon left, then begin with the queue."""
+        for job in self.store.unfinished():
+            self._task(self._recover(job))
+        self._task(self._acquire_all())
+        self._task(self._sweep())
+
+    async def close(self) -> None:
+        """Cancel the scan that acquires; what is being decoded is taken up by the next daemon."""
+        acquiring = self._acquiring
+        if acquiring is not None:
+            await self.cancel(acquiring)
+            deadline = time.monotonic() + 3.0
+            while self._acquiring is acquiring and time.monotonic() < deadline:
+                await asyncio.sleep(0.02)
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._disk.shutdown()
+
+    async def submit(self, params: ScanStart, client: str) -> Job:
+        """The job of these parameters: the one that is there, or a new one, on disk when this returns.
+
+        Raises:
+            Refused: see `JobStore.find`; or too many wait.
+            StorageError: its record cannot be written.
+        """
+        job = self.store.find(params, client)
+        if job is not None:
+            return job
+        if len(self._queue) >= MAX_QUEUED:
+            raise Refused(f"{MAX_QUEUED} scans wait already", reason="queue_full", hint="ask again later")
+        job = self.store.make(params, client)
+        try:
+            await self._save(job)
+        except StorageError:
+            self.store.forget(job)
+            raise
+        self._tell(job, "queued")
+        if job.state is JobState.QUEUED:
+            self._queue.append(job)
+            self._queued.set()
+        return job
+
+    async def cancel(self, job: Job) -> None:
+        """Stop a job. One that is over stays as it is."""
+        if job.state.over:
+            return
+        if job is self._acquiring:
+            self._devices.cancel(job.id)
+        if (series := self._series.get(job.id)) is not None:
+            self._workers.cancel(series)
+        await self._end(job, JobState.CANCELLED, reason="cancelled")
+
+    async def acknowledge(self, job: Job) -> None:
+        """Its client has what it needs."""
+        if not job.acknowledged:
+            job.acknowledged = True
+            await self._save(job)
+
+    async def delete(self, job: Job) -> None:
+        """Delete a job's files now.
+
+        Raises:
+            Refused: it is not over.
+            StorageError: the folder cannot be changed.
+        """
+        if not job.state.over:
+            raise Refused(f"job {job.id} is {job.state}", reason="not_over", hint="cancel it first")
+        await self._on_disk(self.spool.delete, job)
+        await self._save(job)
+        self._publish("spool.deleted", job.id, {})
+
+    # --- acquiring ----------------------------------------------------------------------------------------------
+
+    async def _acquire_all(self) -> None:
+        while True:
+            while not self._queue:
+                self._queued.clear()
+                await self._queued.wait()
+            job = self._queue.popleft()
+            if job.state is not JobState.QUEUED:
+                continue
+            self._acquiring = job
+            try:
+                await self._acquire(job)
+            except ScannerError as error:
+                await self._end(job, JobState.FAILED, reason="failed", error=error)
+            except Exception as error:  # noqa: BLE001  (one scan that fails must not end the daemon)
+                _log.exception("job %s", job.id)
+                await self._end(
+                    job, JobState.FAILED, reason="failed", error=ScannerError(f"the daemon failed: {error}")
+                )
+            finally:
+                self._acquiring = None
+
+    async def _acquire(self, job: Job) -> None:
+        job.become(JobState.ACQUIRING)
+        await self._save(job)
+        self._tell(job, "started")
+        ended = await self._devices.acquire(job.id, self.spool.capture(job.id), job.params, _Listener(self, job))
+        job.captured = max(job.captured, ended.report.get("frames", 0) - len(ended.missing))
+        await self._acquired(job, ended)
+
+    async def _acquired(self, job: Job, ended: Ended) -> None:
+        series = self._series.get(job.id)
+        if job.state.over:
+            return
+        if ended.reason == "completed" and series is not None:
+            job.become(JobState.ACQUIRED)
+            await self._save(job)
+            fields = {"reason": ended.reason, "missing": ended.missing, **ended.report}
+            self._tell(job, "acquired", fields)
+            series.finish("completed", tuple(ended.missing))
+            return
+        if series is not None:
+            self._workers.cancel(series)
+        if ended.reason == "cancelled":
+            await self._end(job, JobState.CANCELLED, reason="cancelled")
+            return
+        error = _error_of(ended)
+        await self._end(job, JobState.FAILED, reason=ended.reason or "refused", error=error)
+
+    async def room_for(self, job: Job, need: Need) -> None:
+        """Make room in the spool for a planned scan.
+
+        Raises:
+            StorageError: there is none.
+        """
+        job.total = need.frames
+        self._tell(job, "plan", {"frames": need.frames, "bytes": need.bytes, "plan": need.plan})
+        # While the scan before decodes, its room is taken already: files reserved ahead count in full.
+        gone = await self._on_disk(self.spool.make_room, need.bytes, list(self.store))
+        for deleted in gone:
+            await self._save(deleted)
+            self._publish("spool.deleted", deleted.id, {})
+
+    def began(self, job: Job) -> None:
+        """A job's capture folder is there: a worker may begin."""
+        self._follow(job, self._new_series(job))
+
+    def frames(self, job: Job, frames: Frames, told: float) -> float:
+        """More frames of a job; returns when the last event about it went out."""
+        retakes = frames.retakes
+        job.captured = frames.captured
+        if (series := self._series.get(job.id)) is not None:
+            series.grew()
+        now = time.monotonic()
+        if now - told < FRAME_EVENT_S and frames.captured < job.total:
+            return told
+        self._tell(job, "retake" if frames.captured == job.total and retakes else "frame", _counts(frames, job.total))
+        return now
+
+    # --- decoding -----------------------------------------------------------------------------------------------
+
+    def _new_series(self, job: Job) -> Series:
+        options = {
+            "decoder": job.params.decoder,
+            "filters": msgspec.to_builtins(job.params.filters),
+            "compare_truth": job.params.compare_truth,
+        }
+        return Series(
+            job=job.id,
+            capture=self.spool.capture(job.id),
+            outputs=self.spool.folder(job.id),
+            options=options,
+            told=lambda message: self._hear(job, message),
+            delivering=lambda number: self._delivering(job, number),
+            deliveries=job.deliveries,
+        )
+
+    def _follow(self, job: Job, series: Series) -> None:
+        self._series[job.id] = series
+        self._task(self._decode(job, series))
+        self._workers.submit(series)
+
+    async def _decode(self, job: Job, series: Series) -> None:
+        interrupted = job.reason == "daemon_restarted"
+        try:
+            result = await series.outcome
+            await self._done(job, series, result)
+        except asyncio.CancelledError:
+            if not series.cancelled:
+                raise
+        except WorkerLost as lost:
+            await self._end(job, JobState.FAILED, reason="worker_lost", error=lost.error)
+        except ScannerError as error:
+            reason = "daemon_restarted" if interrupted else _reason_to_fail(error)
+            await self._end(job, JobState.FAILED, reason=reason, error=error)
+        finally:
+            self._series.pop(job.id, None)
+
+    async def _done(self, job: Job, series: Series, result: Result) -> None:
+        if job.state.over:
+            return
+        job.files, job.report, job.stage = tuple(result.files), result.report, ""
+        reason = job.reason or "completed"
+        await self._end(job, JobState.DONE, reason=reason)
+        await self._on_disk(_remove_other_outputs, series, job.output)
+
+    def _hear(self, job: Job, message: Progress | DecodedNote) -> None:
+        if job.state.over:
+            return
+        if isinstance(message, Progress):
+            job.stage = message.stage
+            if job.state is JobState.ACQUIRED:
+                job.become(JobState.DECODING)
+            self._tell(job, "decoding", {"stage": message.stage})
+            return
+        job.files, job.report = tuple(message.files), message.report
+        job.become(JobState.DECODED)
+        self._tell(job, "decoded", {"report": message.report, "files": msgspec.to_builtins(message.files)})
+
+    def _delivering(self, job: Job, number: int) -> None:
+        job.deliveries += 1
+        job.output = f"scan-{number}"
+        job.files = ()
+        if job.state in (JobState.DECODING, JobState.DECODED):
+            job.become(JobState.ACQUIRED)
+        self._task(self._save(job))
+
+    # --- after a restart ----------------------------------------------------------------------------------------
+
+    async def _recover(self, job: Job) -> None:
+        """Take up a job that an earlier daemon left unfinished. What was whole is decoded, nothing is done again."""
+        capture = self.spool.capture(job.id)
+        state, reason, count = capture_state(capture)
+        was = job.state
+        if state == "none" or (state == "failed" and reason != "daemon_restarted"):
+            error = ScannerError(
+                f"the daemon was restarted while this scan was {was}" + (f" (capture: {reason})" if reason else ""),
+                hint="ask for the scan again with a new job id",
+            )
+            await self._end(job, JobState.FAILED, reason="daemon_restarted", error=error)
+            return
+        job.state = JobState.ACQUIRED
+        if state != "complete":
+            job.reason = "daemon_restarted"
+        missing = missing_patterns(capture, count)
+        job.total, job.captured = count, count - len(missing)
+        await self._save(job)
+        series = self._new_series(job)
+        series.finish("completed" if state == "complete" else "daemon_restarted", missing)
+        self._tell(job, "acquired", {"reason": job.reason or "completed", "missing": list(missing)})
+        self._follow(job, series)
+
+    # --- small things -------------------------------------------------------------------------------------------
+
+    async def _end(self, job: Job, state: JobState, *, reason: str, error: ScannerError | None = None) -> None:
+        if job.state.over:
+            return
+        job.become(state, reason=reason, error=error)
+        try:
+            await self._save(job)
+        except StorageError as problem:
+            _log.error("job %s is %s, which cannot be recorded: %s", job.id, state, problem)
+        fields: dict[str, Any] = {"reason": job.reason}
+        if state is JobState.DONE:
+            fields["files"] = msgspec.to_builtins(job.files)
+        if job.error is not None:
+            fields["error"] = msgspec.to_builtins(job.error)
+        self._tell(job, state.value, fields)
+        _log.info("job %s is %s (%s)", job.id, state, job.reason)
+
+    def _tell(self, job: Job, kind: str, fields: Mapping[str, Any] | None = None) -> None:
+        self._publish(kind, job.id, {"state": job.state.value, **(fields or {})})
+
+    async def _save(self, job: Job) -> None:
+        await self._on_disk(self.store.write, job.id, job.record())
+
+    async def _on_disk(self, function: Callable[..., _T], *arguments: Any) -> _T:
+        return await asyncio.get_running_loop().run_in_executor(self._disk, function, *arguments)
+
+    async def _sweep(self) -> None:
+        while True:
+            for job in await self._on_disk(self.spool.sweep, list(self.store)):
+                await self._save(job)
+                self._publish("spool.deleted", job.id, {})
+            await self._on_disk(self.store.expire, lambda job: not job.deleted and self.spool.folder(job.id).exists())
+            await asyncio.sleep(SWEEP_S)
+
+    def _task(self, coroutine: Any) -> None:
+        task: asyncio.Task[None] = asyncio.create_task(coroutine)
+        self._tasks.add(task)
+        task.add_done_callback(self._finished)
+
+    def _finished(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            _log.error("a task of the pipeline failed", exc_info=error)
+
+
+class _Listener:
+    """What hears of one scan on the devices."""
+
+    def __init__(self, pipeline: Pipeline, job: Job) -> None:
+        self._pipeline = pipeline
+        self._job = job
+        self._told = 0.0
+
+    async def need(self, need: Need) -> None:
+        await self._pipeline.room_for(self._job, need)
+
+    def began(self) -> None:
+        self._pipeline.began(self._job)
+
+    def frames(self, frames: Frames) -> None:
+        self._told = self._pipeline.frames(self._job, frames, self._told)
+
+
+def _counts(frames: Frames, total: int) -> dict[str, Any]:
+    return {"captured": frames.captured, "total": total, "retakes": frames.retakes}
+
+
+def _error_of(ended: Ended) -> ScannerError:
+    if isinstance(ended.error, ErrorBody):
+        return error_from_body(ended.error)
+    return ScannerError(f"the scan ended: {ended.reason}")
+
+
+def _reason_to_fail(error: ScannerError) -> str:
+    match error:
+        case SyncError():
+            return "sync_lost"
+        case StorageError():
+            return "disk_full"
+        case ConfigError():
+            return "refused"
+        case _:
+            return "decode_failed"
+
+
+def _remove_other_outputs(series: Series, kept: str | None) -> None:
+    """What dead deliveries wrote."""
+    for folder in series.outputs.glob("scan-*"):
+        if folder.name != kept:
+            shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,258 @@
+"""From a rig and a scan's parameters to what the sequencer runs: devices, calibration, patterns. Runs in the devices
+process; it opens devices through the registry and takes no frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from drivers import registry
+from scanner.clock import Clock
+from scanner.devices import CameraSettings, Interval, KnowsTruth, ProjectorKind, TriggerMode
+from scanner.errors import ConfigError, DecodeError
+from scanner.geometry import Calibration, load_calibration
+from scanner.patterns import (
+    Axis,
+    GrayPattern,
+    McpPattern,
+    Pattern,
+    PatternSequence,
+    PmpPattern,
+    ProjectorSize,
+    pattern_from_description,
+)
+from scanner.patterns.sequence import Precorrection
+from scanner.sequencer import Rig, measure_latency
+from scanner.wire import ScanStart
+
+METHODS = ("pmp", "mcp", "gray")
+
+PMP_FINEST = 64
+"""Cycles of the finest default fringe."""
+
+PMP_LEAST_PERIOD_PX = 8
+"""A default fringe has at least this many projector pixels: four for each half wave, so that it is still a cosine."""
+
+
+@dataclass
+class OpenRig:
+    """The opened devices, the rig file's words on them, and what was measured of them since."""
+
+    rig: Rig
+    settings: Mapping[str, Any]
+    """the rig file as plain data"""
+    calibration: Calibration | None
+
+    @property
+    def projector(self) -> ProjectorSize:
+        """Size of the projected image."""
+        capabilities = self.rig.projector.capabilities
+        return ProjectorSize(capabilities.width, capabilities.height)
+
+    @property
+    def exposure(self) -> float | str | None:
+        """The rig file's exposure: microseconds, "auto" or None."""
+        value: float | str | None = self.settings["camera"]["settings"]["exposure_us"]
+        return value
+
+    def measure_latency(self, clock: Clock) -> None:
+        """Measure the projector's latency and settling, once, where neither rig file nor driver knows them.
+
+        Raises:
+            SyncError: black and white cannot be told apart.
+            DeviceError: a device failed.
+        """
+        rig, declared = self.rig, self.rig.projector.capabilities
+        known = (rig.latency or declared.latency) is not None and (rig.settle or declared.settle) is not None
+        if known or declared.kind is not ProjectorKind.FRAMEBUFFER:
+            return
+        latency, settle = measure_latency(
+            rig.projector, rig.camera, clock, settings=rig.settings, trigger_mode=rig.trigger_mode
+        )
+        self.rig = replace(rig, latency=latency, settle=settle)
+
+    def close(self) -> None:
+        """Give the devices back, the projector black last."""
+        self.rig.camera.close()
+        if self.rig.trigger is not None:
+            self.rig.trigger.close()
+        self.rig.projector.close()
+
+
+def open_rig(settings: Mapping[str, Any], clock: Clock) -> OpenRig:
+    """Open a rig's devices.
+
+    Args:
+        settings: `RigConfig.model_dump(mode="json")`.
+        clock: the time that devices and sequencer live in.
+
+    Raises:
+        ConfigError, DeviceError: see `drivers.registry`.
+        CalibrationError: the rig file's calibration is unusable.
+    """
+    camera_part, projector_part, trigger_part = (settings[key] for key in ("camera", "projector", "trigger"))
+    path = settings["rig"]["calibration"]
+    calibration = None if path is None else load_calibration(Path(path))
+    options = dict(projector_part["options"])
+    if projector_part["mode"] is not None:
+        options["mode"] = projector_part["mode"]
+    projector = registry.open_projector(projector_part["driver"], projector_part["device"], options, clock)
+    try:
+        camera = registry.open_camera(camera_part["driver"], camera_part["device"], camera_part["options"], clock)
+    except BaseException:
+        projector.close()
+        raise
+    try:
+        trigger = (
+            None
+            if trigger_part is None
+            else registry.open_trigger(trigger_part["driver"], trigger_part["device"], trigger_part["options"], clock)
+        )
+        if calibration is None and isinstance(camera, KnowsTruth):
+            calibration = camera.true_calibration()
+        wanted = camera_part["settings"]
+        region = wanted["region"]
+        camera_settings = camera.apply(
+            CameraSettings(
+                gain_db=wanted["gain_db"],
+                pixel_format=wanted["pixel_format"],
+                region=None if region is None else (region[0], region[1], region[2], region[3]),
+            )
+        )
+    except BaseException:
+        camera.close()
+        projector.close()
+        raise
+    mode = wanted["trigger_mode"]
+    rig = Rig(
+        projector=projector,
+        camera=camera,
+        trigger=trigger,
+        latency=_interval(projector_part["latency_us"]),
+        settle=_interval(projector_part["settle_us"]),
+        dwell=projector_part["dwell"],
+        settings=replace(camera_settings, exposure_ns=None),
+        trigger_mode=None if mode is None else TriggerMode(mode),
+        mirror=projector_part["mirror"],
+        rotate=projector_part["rotate"],
+    )
+    return OpenRig(rig, settings, calibration)
+
+
+def sequence_for(opened: OpenRig, params: ScanStart) -> PatternSequence:
+    """The sequence that a scan projects: the method's pattern, bracketed, pre-corrected for the rig's response.
+
+    Raises:
+        ConfigError: unknown method, or a pattern that contradicts it or does not fit the projector.
+    """
+    projector = opened.projector
+    known: Any = opened.calibration.phase_axis if opened.calibration else "y"
+    axis: Axis = opened.settings["rig"]["phase_axis"] or known
+    try:
+        pattern = pattern_for(params.method, params.pattern or {}, axis, projector)
+        return PatternSequence.bracketed(projector, pattern, _precorrection(opened.calibration))
+    except DecodeError as error:
+        raise ConfigError(error.message, hint=error.hint) from error
+
+
+def pattern_for(method: str, given: Mapping[str, Any], axis: Axis, projector: ProjectorSize) -> Pattern:
+    """A method's pattern: the given members, the others by default for this projector.
+
+    Raises:
+        ConfigError: unknown method.
+        DecodeError: a member is wrong.
+    """
+    if method not in METHODS:
+        raise ConfigError(f"unknown method {method!r}", hint=f"methods: {', '.join(METHODS)}")
+    if given.get("method", method) != method:
+        raise ConfigError(f"the pattern is {given['method']!r}, the method {method!r}", hint="leave one of them out")
+    default = default_pattern(method, tuple(given.get("axes") or (axis,)), given.get("axis", axis), projector)
+    described = {**default.describe(), **given}
+    if method == "pmp" and "frequencies" in given and "shifts" not in given:
+        described["shifts"] = [8] * len(given["frequencies"])
+    return pattern_from_description(described)
+
+
+def default_pattern(method: str, axes: tuple[Axis, ...], axis: Axis, projector: ProjectorSize) -> Pattern:
+    """A method's default pattern on this projector."""
+    if method == "pmp":
+        return PmpPattern(axes=axes, frequencies=_pmp_frequencies(axes, projector), shifts=(8, 8, 8))
+    if method == "gray":
+        bits = max(math.ceil(math.log2(projector.along(a))) for a in axes)
+        return GrayPattern(axes=axes, bits=bits, code_bits=bits)
+    pattern = McpPattern(axis=axis)
+    try:
+        pattern.validate(projector)
+    except DecodeError:
+        return _smaller_mcp(pattern, projector)
+    return pattern
+
+
+def _pmp_frequencies(axes: tuple[Axis, ...], projector: ProjectorSize) -> tuple[float, ...]:
+    least = min(projector.along(axis) for axis in axes)
+    finest = min(PMP_FINEST, max(4, least // PMP_LEAST_PERIOD_PX))
+    # Equal ratios: each step of the unwrapping then has the same margin.
+    return (1.0, float(round(math.sqrt(finest))), float(finest))
+
+
+def _smaller_mcp(pattern: McpPattern, projector: ProjectorSize) -> McpPattern:
+    """Carriers in proportion to the projector, and as many bits as leave stripes and gaps that can be decoded."""
+    across = projector.along("x" if pattern.axis == "y" else "y")
+    scale = across / 3 / max(pattern.carriers) / 1.6  # the default's own margin below the limit, on 1152 pixels: 1.7
+    carriers = tuple(float(round(carrier * scale)) for carrier in pattern.carriers)
+    problem: DecodeError | None = None
+    for bits in range(pattern.bits, 1, -1):
+        codes = pattern.codes if bits == pattern.bits else tuple(range(1 << bits))
+        try:
+            smaller = replace(pattern, bits=bits, carriers=carriers[-bits:], codes=codes)
+            smaller.validate(projector)
+        except DecodeError as error:
+            problem = error
+            continue
+        return smaller
+    raise ConfigError(
+        f"a projector of {projector.width} x {projector.height} is too small for mcp: {problem}",
+        hint="use pmp, or give a pattern of your own",
+    )
+
+
+def _precorrection(calibration: Calibration | None) -> Precorrection | None:
+    """What undoes the projector's response: its inverse."""
+    response = ((calibration.extra.get("response") or {}) if calibration else {}).get("projector")
+    if not response:
+        return None
+    gamma, table = response.get("gamma"), response.get("table")
+    if gamma is not None:
+        return None if gamma == 1 else Precorrection(gamma=float(gamma))
+    if table is None:
+        return None
+    return Precorrection(table=inverse_table(table))
+
+
+def inverse_table(table: Any) -> tuple[float, ...]:
+    """The input value 0 .. 255 for each light k / 255, from the light 0 .. 1 of each input value.
+
+    Raises:
+        ConfigError: it is no response: not 256 rising numbers.
+    """
+    values = [float(value) for value in table]
+    rising = all(low <= high for low, high in pairwise(values))
+    if len(values) != 256 or not rising or values[0] < 0 or values[-1] > 1 or values[0] == values[-1]:
+        raise ConfigError("calibration: response.projector.table must be 256 rising values of light, 0 .. 1")
+    import numpy as np  # noqa: PLC0415  (of this module's uses the only one)
+
+    # Light that the projector cannot make is given its nearest: np.interp holds the ends. Flat parts keep one value.
+    light, index = np.unique(values, return_index=True)
+    return tuple(float(v) for v in np.interp(np.arange(256) / 255, light, index))
+
+
+def _interval(microseconds: Any) -> Interval | None:
+    if microseconds is None:
+        return None
+    low, high = microseconds if isinstance(microseconds, list | tuple) else (microseconds, microseconds)
+    return Interval(round(low * 1000), round(high * 1000))

@@ -1,0 +1,143 @@
+"""One series on its way from the spool to a worker: what is in the folder, and what has become of it.
+
+The sender reads frames.jsonl behind the devices process, so that a slow worker costs page cache and not frames, and a
+second delivery or one after a restart is the same as the first. No pixel passes through here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from scanner.errors import StorageError
+from scanner.stream import DecodedNote, EndReason, Frame, Progress, Result
+
+HEADER = "capture.json"
+RECORDS = "frames.jsonl"
+FRAMES = "frames.npy"
+
+
+@dataclass(frozen=True)
+class SeriesEnd:
+    """How a series ended."""
+
+    reason: EndReason
+    missing: tuple[int, ...] = ()
+
+
+@dataclass
+class Series:
+    """One capture folder to be decoded, open or closed.
+
+    `changed` is set when there are more lines or the end is known; `outcome` is the worker's result, or the error that
+    ended it. `told` hears what a worker says meanwhile.
+    """
+
+    job: str
+    capture: Path
+    outputs: Path
+    """each delivery writes into a folder of its own in here"""
+    options: Mapping[str, Any]
+    told: Callable[[Progress | DecodedNote], None]
+    delivering: Callable[[int], None]
+    """hears of each delivery before it begins, with its number"""
+    deliveries: int = 0
+    end: SeriesEnd | None = None
+    cancelled: bool = False
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+    outcome: asyncio.Future[Result] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
+
+    def grew(self) -> None:
+        """There are more lines."""
+        self.changed.set()
+
+    def finish(self, reason: EndReason, missing: tuple[int, ...] = ()) -> None:
+        """There will be no more lines."""
+        self.end = SeriesEnd(reason, missing)
+        self.changed.set()
+
+    def output(self, delivery: int) -> Path:
+        """Where a delivery's worker writes the scan."""
+        return self.outputs / f"scan-{delivery}"
+
+
+class RecordTail:
+    """Reads frames.jsonl while it grows, as `frame` messages."""
+
+    def __init__(self, capture: Path, delivery: int) -> None:
+        """Raise StorageError where the folder is not a capture."""
+        self.sent = 0
+        self._delivery = delivery
+        self._position = 0
+        self._path = capture / FRAMES
+        try:
+            camera = json.loads((capture / HEADER).read_bytes())["camera"]
+            self._frame_bytes = camera["width"] * camera["height"] * (1 if camera.get("bits", 8) <= 8 else 2)
+            with self._path.open("rb") as file:
+                head = file.read(10)
+            # An NPY file of version 1: magic, version, then the header's length (2 bytes), then the header.
+            self._first = 10 + int.from_bytes(head[8:10], "little")
+            self._records = (capture / RECORDS).open("rb")
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise StorageError(f"{capture} is not a capture that can be sent: {error}") from error
+
+    def read(self, limit: int) -> Iterator[Frame]:
+        """The next whole lines, at most `limit`."""
+        self._records.seek(self._position)
+        for _ in range(limit):
+            line = self._records.readline()
+            if not line.endswith(b"\n"):
+                return  # still being written, or torn by a crash: either way it does not exist
+            self._position += len(line)
+            record = _parsed(line)
+            if record is None:
+                continue
+            slot = record["slot"]
+            yield Frame(
+                delivery=self._delivery,
+                index=self.sent,
+                pattern=record["pattern"],
+                slot=slot,
+                status=record.get("status", "ok"),
+                path=str(self._path),
+                offset=0 if slot is None else self._first + slot * self._frame_bytes,
+                xxh3=record.get("xxh3"),
+            )
+            self.sent += 1
+
+    def close(self) -> None:
+        """Close the file. May be called twice."""
+        self._records.close()
+
+
+def _parsed(line: bytes) -> dict[str, Any] | None:
+    try:
+        record: dict[str, Any] = json.loads(line)
+        return record if {"slot", "pattern"} <= record.keys() else None
+    except (ValueError, AttributeError):
+        return None
+
+
+def capture_state(capture: Path) -> tuple[str, str | None, int]:
+    """(state, reason, frames planned) of a capture folder; ("none", None, 0) where there is none."""
+    try:
+        content = json.loads((capture / HEADER).read_bytes())
+        plan = content.get("plan") or {}
+        count = int(plan.get("patterns", 0)) * int(plan.get("repeat", 1))
+        return str(content["state"]), content.get("reason"), count
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return "none", None, 0
+
+
+def missing_patterns(capture: Path, count: int) -> tuple[int, ...]:
+    """Pattern indices without a whole line."""
+    try:
+        lines = (capture / RECORDS).read_bytes().split(b"\n")[:-1]
+    except OSError:
+        lines = []
+    last = {record["pattern"]: record for line in lines if (record := _parsed(line)) is not None}
+    return tuple(pattern for pattern in range(count) if last.get(pattern, {}).get("slot") is None)
