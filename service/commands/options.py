@@ -47,7 +47,9 @@ AxisOption = Annotated[
     str | None,
     typer.Option(metavar="x|y|xy", help="Phase direction: y measures projector rows, x columns. Default: the rig's."),
 ]
-Bits = Annotated[int | None, typer.Option(min=1, max=16, help="MCP: bits of a code word; gray: bits shown.")]
+Bits = Annotated[
+    int | None, typer.Option(metavar="N", min=1, max=16, help="MCP: bits of a code word; gray: bits shown.")
+]
 Carriers = Annotated[
     str | None, typer.Option(metavar="F,F,...", help="MCP: one carrier a bit, cycles along the stripes.")
 ]
@@ -158,7 +160,9 @@ Box = Annotated[
     str | None,
     typer.Option(metavar="X0:X1,Y0:Y1,Z0:Z1", help="Keep points in this box, mm, camera frame; sides may be empty."),
 ]
-MinConfidence = Annotated[float | None, typer.Option(min=0.0, max=1.0, help="Keep points of at least this confidence.")]
+MinConfidence = Annotated[
+    float | None, typer.Option(metavar="C", min=0.0, max=1.0, help="Keep points of at least this confidence.")
+]
 EdgeFilter = Annotated[
     bool, typer.Option("--edge-filter/--no-edge-filter", help="Take out points that fly at depth edges.")
 ]

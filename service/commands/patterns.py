@@ -40,7 +40,8 @@ def patterns(
     profile: Profile = None,
     levels: Levels = None,
     gamma: Annotated[
-        float | None, typer.Option(min=0.1, max=10.0, help="The projector's gamma, corrected for in the images.")
+        float | None,
+        typer.Option(metavar="G", min=0.1, max=10.0, help="The projector's gamma, corrected for in the images."),
     ] = None,
     bracketed: Annotated[
         bool, typer.Option("--bracketed", help="With the sentinels and order bars that a scan projects.")

@@ -51,7 +51,7 @@ def scan(
         str | None,
         typer.Option(metavar="RIG", help="A rig file, or simulated[:SCENE], as simulated:bench2026/sphere_board."),
     ] = None,
-    method: Annotated[Method, typer.Option(help="What to project.")] = Method.PMP,
+    method: Annotated[Method, typer.Option(metavar="pmp|mcp|gray", help="What to project.")] = Method.PMP,
     output: OutputFolder = None,
     connect: Connect = None,
     exposure: Annotated[
@@ -64,12 +64,12 @@ def scan(
     carriers: Carriers = None,
     profile: Profile = None,
     levels: Levels = None,
-    repeat: Annotated[int, typer.Option(min=1, max=1000, help="Repetitions of the whole sequence.")] = 1,
+    repeat: Annotated[int, typer.Option(metavar="N", min=1, max=1000, help="Repetitions of the whole sequence.")] = 1,
     depth: Depth = None,
     box: Box = None,
     min_confidence: MinConfidence = None,
     edge_filter: EdgeFilter = True,
-    decoder: Annotated[str, typer.Option(help="Decoder, by name.")] = "default",
+    decoder: Annotated[str, typer.Option(metavar="NAME", help="Decoder, by name.")] = "default",
     compare_truth: Annotated[
         bool, typer.Option("--compare-truth", help="Simulated rigs: compare with the truth, in the report and a map.")
     ] = False,
