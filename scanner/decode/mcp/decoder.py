@@ -230,7 +230,8 @@ def _locate(image: Image, model: PatternModel, camera: CameraFormat, clock: _Sta
         return found
     around = found.pitch / model.pitch
     with clock.stage("peaks"):
-        found.peaks = stripes.find_peaks(found.reduced, found.pitch, around / float(model.carriers.min()), found.noise)
+        longest = around / float(model.carriers.min())
+        found.peaks = stripes.find_peaks(found.reduced, found.pitch, longest, found.noise, model.weakest)
     with clock.stage("chains"):
         found.chains = linking.link(found.peaks, found.pitch)
         found.signals = carriers.signals_along(image, found.peaks, found.chains, found.pitch, camera.max_value)
@@ -290,13 +291,11 @@ def _decide(found: _Found, model: PatternModel, clock: _Stages) -> _Decision:
     floor = np.full(model.channels, 0.03, np.float32)
     tables = hmm.transitions(model.stripes)
     gap = hmm.gaps(peaks.start, peaks.y, found.pitch)
-    top = np.maximum(model.ratio.max(axis=0), 1e-3)
-    stray_log = float(-np.log(1.5 * top).sum())
     votes = np.zeros((len(peaks), model.stripes), np.float32)
     posterior = votes
     for _ in range(ROUNDS):
         with clock.stage("emissions"):
-            evidence = emissions.log_likelihood(seen, model, modulation, floor)
+            evidence, stray_log = emissions.log_likelihood(seen, model, modulation, floor)
         with clock.stage("columns' model"):
             posterior, _stray = hmm.smooth_columns(evidence + votes, peaks.start, gap, tables, stray_log)
         with clock.stage("votes"):
@@ -311,7 +310,8 @@ def _decide(found: _Found, model: PatternModel, clock: _Stages) -> _Decision:
     long_enough = np.repeat(chains.lengths * stripes.STEP >= MIN_CHAIN_PX, chains.lengths)
     in_long = np.zeros(len(peaks), bool)
     in_long[chains.order] = long_enough
-    label = np.where((path == along) & (confidence >= DECIDED) & in_long, path, -1).astype(np.int32)
+    beyond = linking.silhouettes(found.reduced, peaks, chains)
+    label = np.where((path == along) & (confidence >= DECIDED) & in_long & ~beyond, path, -1).astype(np.int32)
     agrees = emissions.agreement(seen, evidence, model, modulation, path, (peaks.start, gap))
     with clock.stage("sub-pixel"):
         fine = subpixel.refine(found.reduced, peaks, chains, label, found.pitch)

@@ -27,6 +27,9 @@ JUMP = 2e-4
 BACK = 2e-6
 """Probability of any one jump backwards."""
 
+REPEAT = 0.02
+"""Probability ratio of the same stripe once more: one half on an object, the other on what lies behind its edge."""
+
 STRAY = 0.01
 """Probability that a peak is no stripe."""
 
@@ -52,7 +55,7 @@ def transitions(stripes: int) -> Array:
     for gap in range(1, MAX_GAP + 1):
         regular = MISS ** np.abs(step - gap) * (1 - MISS)
         table = np.where(step > 0, np.maximum(regular, JUMP), BACK)
-        tables.append(np.where(step == 0, BACK, table))
+        tables.append(np.where(step == 0, REPEAT, table))
     return np.ascontiguousarray(tables, np.float32)
 
 
@@ -65,7 +68,7 @@ def gaps(start: Ints, y: Array, pitch: float) -> Ints:
     return result
 
 
-def smooth_columns(evidence: Array, start: Ints, gap: Ints, tables: Array, stray_log: float) -> tuple[Array, Array]:
+def smooth_columns(evidence: Array, start: Ints, gap: Ints, tables: Array, stray_log: Array) -> tuple[Array, Array]:
     """Forward-backward over each column.
 
     Args:
@@ -73,7 +76,7 @@ def smooth_columns(evidence: Array, start: Ints, gap: Ints, tables: Array, stray
         start: (B + 1,) int32, where columns begin.
         gap: (P,) int32, pitches to the peak before.
         tables: of `transitions`.
-        stray_log: log-likelihood of what is seen at a peak that is no stripe.
+        stray_log: (P,) float32, log-likelihood of what is seen at a peak that is no stripe.
 
     Returns:
         posterior (P, S) float32 and the probability of a stray peak (P,) float32.
@@ -81,7 +84,7 @@ def smooth_columns(evidence: Array, start: Ints, gap: Ints, tables: Array, stray
     posterior = np.zeros_like(evidence)
     stray = np.zeros(len(evidence), np.float32)
     turned = np.ascontiguousarray(tables.transpose(0, 2, 1))
-    _forward_backward(evidence, start, gap, tables, turned, np.float32(stray_log), posterior, stray)
+    _forward_backward(evidence, start, gap, tables, turned, stray_log, posterior, stray)
     return posterior, stray
 
 
@@ -142,7 +145,7 @@ def _forward_backward(
     gap: Ints,
     tables: Array,
     turned: Array,
-    stray_log: np.float32,
+    stray_log: Array,
     posterior: Array,
     stray: Array,
 ) -> None:
@@ -159,7 +162,7 @@ def _forward_backward(
         first, size = start[b], start[b + 1] - start[b]
         alpha[0, :] = np.float32(1) / np.float32(states)
         for t in range(size):
-            lost[t] = _likelihoods(evidence[first + t], stray_log, likely[t])
+            lost[t] = _likelihoods(evidence[first + t], stray_log[first + t], likely[t])
             if t == 0:
                 moved[0, :] = alpha[0]
             else:
@@ -187,13 +190,13 @@ def _forward_backward(
                 _normalise(beta)
 
 
-def best_paths(evidence: Array, start: Ints, gap: Ints, tables: Array, stray_log: float) -> Ints:
+def best_paths(evidence: Array, start: Ints, gap: Ints, tables: Array, stray_log: Array) -> Ints:
     """Viterbi (1967) over each column: (P,) int32, the stripe, or -1 where the best path takes the peak for stray.
 
     Arguments as for `smooth_columns`.
     """
     path = np.full(len(evidence), -1, np.int32)
-    _viterbi(evidence, start, gap, np.log(tables), np.float32(stray_log), path)
+    _viterbi(evidence, start, gap, np.log(tables), stray_log, path)
     return path
 
 
@@ -212,7 +215,7 @@ def _best_sources(score: Array, table: Array, best: Array, source: Ints) -> None
 
 
 @kernel
-def _viterbi(evidence: Array, start: Ints, gap: Ints, logs: Array, stray_log: np.float32, path: Ints) -> None:
+def _viterbi(evidence: Array, start: Ints, gap: Ints, logs: Array, stray_log: Array, path: Ints) -> None:
     states = evidence.shape[1]
     longest = _longest(start)
     came = np.empty((longest, states), np.int32)
@@ -220,7 +223,7 @@ def _viterbi(evidence: Array, start: Ints, gap: Ints, logs: Array, stray_log: np
     score = np.empty(states, np.float32)
     best = np.empty(states, np.float32)
     source = np.empty(states, np.int32)
-    keep, lose = np.float32(np.log(1 - STRAY)), np.float32(np.log(STRAY)) + stray_log
+    keep, lose = np.float32(np.log(1 - STRAY)), np.float32(np.log(STRAY))
     for b in range(len(start) - 1):
         first, size = start[b], start[b + 1] - start[b]
         score[:] = 0
@@ -232,7 +235,7 @@ def _viterbi(evidence: Array, start: Ints, gap: Ints, logs: Array, stray_log: np
                 _best_sources(score, logs[gap[first + t] - 1], best, source)
             for s in range(states):
                 taken = best[s] + keep + evidence[first + t, s]
-                passed = score[s] + lose
+                passed = score[s] + lose + stray_log[first + t]
                 real[t, s] = taken >= passed
                 came[t, s] = source[s] if taken >= passed else s
                 score[s] = max(taken, passed)

@@ -20,6 +20,10 @@ Array = NDArray[np.float32]
 Ints = NDArray[np.int32]
 
 
+BEND = 0.05
+"""Distance of a peak from its chain's line, in pitches to a column, that ends the chain."""
+
+
 @dataclass(frozen=True, eq=False)
 class Chains:
     """order: (P,) int32, peaks chain by chain, left to right. start: (C + 1,) int32, where chains begin in `order`.
@@ -43,7 +47,7 @@ def link(peaks: Peaks, pitch: float) -> Chains:
     (0.5 is the next valley; the profile's flank must stay in the fit window).
     """
     column = np.repeat(np.arange(len(peaks.start) - 1, dtype=np.int32), np.diff(peaks.start))
-    order, start = _link(peaks.start, peaks.y, peaks.height, np.float32(0.3 * pitch), np.float32(0.12 * pitch))
+    order, start = _link(peaks.start, peaks.y, peaks.height, np.float32(0.3 * pitch), np.float32(BEND * pitch))
     return Chains(order, start, column)
 
 
@@ -98,6 +102,39 @@ def _link(start: Ints, y: Array, height: Array, reach: np.float32, bend: np.floa
             k = after[k]
     chains[c] = n
     return order, chains[: c + 1].copy()
+
+
+def silhouettes(reduced: Array, peaks: Peaks, chains: Chains) -> NDArray[np.bool_]:
+    """Peaks at a chain's end that lie beyond the object's edge: (P,) bool.
+
+    Smoothing over a carrier's period carries a stripe past the edge of what it falls on; there the columns as they are
+    show less than half the brightness of the columns further in.
+    """
+    beyond = np.zeros(len(peaks), np.bool_)
+    _silhouettes(reduced, peaks.y, peaks.valley, chains.order, chains.start, chains.column, beyond)
+    return beyond
+
+
+@kernel
+def _silhouettes(
+    reduced: Array, y: Array, valley: Array, order: Ints, start: Ints, column: Ints, beyond: NDArray[np.bool_]
+) -> None:
+    inner = 8
+    for c in range(len(start) - 1):
+        first, size = start[c], start[c + 1] - start[c]
+        for way in range(2):
+            for step in range(min(size, inner)):
+                p = first + step if way == 0 else first + size - 1 - step
+                total, count = np.float32(0), 0
+                for further in range(step + 1, min(step + 1 + inner, size)):
+                    k = order[first + further] if way == 0 else order[first + size - 1 - further]
+                    total += reduced[column[k], int(y[k] + np.float32(0.5))] - valley[k]
+                    count += 1
+                k = order[p]
+                here = reduced[column[k], int(y[k] + np.float32(0.5))] - valley[k]
+                if count == 0 or here * count >= np.float32(0.5) * total:
+                    break
+                beyond[k] = True
 
 
 def votes_along(log_posterior: Array, chains: Chains, reach: float, gain: float) -> Array:

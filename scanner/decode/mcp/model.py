@@ -65,6 +65,11 @@ class PatternModel:
         return len(self.carriers)
 
     @cached_property
+    def weakest(self) -> float:
+        """Mean light of the dimmest stripe that has any, over that of the brightest."""
+        return float(self.level[self.level > 0].min() / self.level.max())
+
+    @cached_property
     def separation(self) -> float:
         """Smallest distance between two carriers, and from the lowest to DC, cycles per projector pixel."""
         ordered = np.sort(np.concatenate(([0.0], self.carriers)))

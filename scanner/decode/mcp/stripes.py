@@ -38,6 +38,12 @@ _LOG_STEP = 0.01
 HEIGHT_FLOOR = 0.04
 """Stripes lower than this share of the 99th percentile are left out: what lies outside the object (mcp.md, sec. 3)."""
 
+BORDER = 0.15
+"""Pitches from the image's border within which a peak counts as cut: less than a third of its flank is there."""
+
+LEAST_FLANK = 0.4
+"""Least ratio of a stripe's two flanks: below it one is cut off by an edge of the object."""
+
 
 @dataclass(frozen=True, eq=False)
 class Peaks:
@@ -145,7 +151,7 @@ def _log_spectrum(columns: Array, axis: NDArray[np.float64]) -> NDArray[np.float
     return np.asarray(np.convolve(on_axis, taps / taps.sum(), mode="same"))
 
 
-def find_peaks(reduced: Array, pitch: float, carrier_px: float, noise: float) -> Peaks:
+def find_peaks(reduced: Array, pitch: float, carrier_px: float, noise: float, weakest: float = 1.0) -> Peaks:
     """Peaks of all stripes.
 
     Args:
@@ -153,6 +159,7 @@ def find_peaks(reduced: Array, pitch: float, carrier_px: float, noise: float) ->
         pitch: mean pitch, px.
         carrier_px: longest period of a carrier, px: columns are smoothed over it, or peaks break up at its troughs.
         noise: 1 sigma of `reduced`, grey levels.
+        weakest: mean light of the pattern's dimmest stripe over that of its brightest.
     """
     sigma_x, sigma_y = 0.3 * carrier_px / STEP, pitch / 12
     smooth = np.asarray(
@@ -166,8 +173,15 @@ def find_peaks(reduced: Array, pitch: float, carrier_px: float, noise: float) ->
     heights = rows[:, 1]
     if not len(heights):
         return _as_peaks(start, rows)
-    floor = max(HEIGHT_FLOOR * float(np.percentile(heights, 99)), 8 * left)
-    keep = heights >= floor
+    floor = HEIGHT_FLOOR * float(np.percentile(heights, 99))
+    # The published pattern's modulated stripes are dim beside bright ones: those count by their neighbours' height.
+    beside = np.zeros_like(heights)
+    inner = np.ones(len(heights), bool)
+    inner[start[:-1][start[:-1] < len(heights)]] = False
+    beside[1:] = np.where(inner[1:], heights[:-1], 0)
+    beside[:-1] = np.maximum(beside[:-1], np.where(inner[1:], heights[1:], 0))
+    dim = (beside >= floor) & (heights >= 0.3 * weakest * beside)
+    keep = ((heights >= floor) | dim) & (heights >= 8 * left)
     counts = np.add.reduceat(np.append(keep, False).astype(np.int32), np.minimum(start[:-1], len(keep)))
     counts[start[:-1] == start[1:]] = 0
     return _as_peaks(np.concatenate(([0], np.cumsum(counts))).astype(np.int32), rows[keep])
@@ -179,8 +193,61 @@ def _as_peaks(start: NDArray[np.int32], rows: Array) -> Peaks:
 
 
 @kernel
+def _turning_points(line: Array, delta: np.float32, tops: NDArray[np.int32], lows: NDArray[np.int32]) -> int:
+    """Maxima and minima in turn, each `delta` from its neighbours (hysteresis); returns the number of maxima.
+
+    lows[k] lies before tops[k], lows[n] after the last.
+    """
+    n = 0
+    rising = True
+    low_at, top_at = 0, 0
+    for y in range(1, len(line)):
+        value = line[y]
+        if rising:
+            if value > line[top_at]:
+                top_at = y
+            elif value < line[top_at] - delta:
+                if line[top_at] > line[low_at] + delta or n == 0:
+                    lows[n] = low_at
+                    tops[n] = top_at
+                    n += 1
+                rising = False
+                low_at = y
+        elif value < line[low_at]:
+            low_at = y
+        elif value > line[low_at] + delta:
+            rising = True
+            top_at = y
+    lows[n] = low_at
+    return n
+
+
+@kernel
+def _describe(line: Array, top: int, above: int, below: int, pitch: np.float32, row: Array) -> None:
+    """The six figures of `Peaks` for one maximum."""
+    size = len(line)
+    left, right = line[top] - line[above], line[top] - line[below]
+    valley = line[above] + (line[below] - line[above]) * (top - above) / max(below - above, 1)
+    curve = line[top - 1] - 2 * line[top] + line[top + 1]
+    row[0] = top
+    if curve < 0:
+        row[0] += np.float32(0.5) * (line[top - 1] - line[top + 1]) / curve
+    # A flank that the border cuts is held to the part of it that is there.
+    half = np.float32(0.5) * pitch
+    left /= min(np.float32(1), top / half)
+    right /= min(np.float32(1), (size - 1 - top) / half)
+    reach = np.float32(BORDER) * pitch
+    inside = top >= reach and top <= size - 1 - reach
+    row[1] = line[top] - valley
+    row[2] = valley
+    row[3] = above
+    row[4] = below
+    row[5] = 1.0 if inside and min(left, right) > np.float32(LEAST_FLANK) * max(left, right) else 0.0
+
+
+@kernel
 def _peaks_of(smooth: Array, delta: np.float32, pitch: np.float32) -> tuple[NDArray[np.int32], Array]:
-    """Maxima and minima in turn, each `delta` away from its neighbours (hysteresis), with their figures."""
+    """All maxima of all columns with their figures: where columns begin (B + 1,), and (P, 6)."""
     columns, size = smooth.shape
     start = np.zeros(columns + 1, np.int32)
     capacity = columns * (int(size / (0.3 * pitch)) + 4)
@@ -189,48 +256,12 @@ def _peaks_of(smooth: Array, delta: np.float32, pitch: np.float32) -> tuple[NDAr
     lows = np.empty(size + 2, np.int32)
     count = 0
     for b in range(columns):
-        line = smooth[b]
-        n = 0  # tops found; lows[k] lies before tops[k], lows[n] after the last
-        rising = True
-        low_at, top_at = 0, 0
-        for y in range(1, size):
-            value = line[y]
-            if rising:
-                if value > line[top_at]:
-                    top_at = y
-                elif value < line[top_at] - delta:
-                    if line[top_at] > line[low_at] + delta or n == 0:
-                        lows[n] = low_at
-                        tops[n] = top_at
-                        n += 1
-                    rising = False
-                    low_at = y
-            elif value < line[low_at]:
-                low_at = y
-            elif value > line[low_at] + delta:
-                rising = True
-                top_at = y
-        lows[n] = low_at
-        for k in range(n):
-            top, above, below = tops[k], lows[k], lows[k + 1]
-            if top < 1 or top > size - 2 or count >= capacity:
-                continue
-            # A valley further than a pitch away is flat ground: its near end counts.
-            above = max(above, top - int(pitch))
-            below = min(below, top + int(pitch))
-            left, right = line[top] - line[above], line[top] - line[below]
-            share = (top - above) / max(below - above, 1)
-            valley = line[above] + (line[below] - line[above]) * share
-            curve = line[top - 1] - 2 * line[top] + line[top + 1]
-            shift = np.float32(0.5) * (line[top - 1] - line[top + 1]) / curve if curve < 0 else np.float32(0)
-            reach = np.float32(0.3) * pitch
-            inside = top >= reach and top <= size - 1 - reach
-            rows[count, 0] = top + shift
-            rows[count, 1] = line[top] - valley
-            rows[count, 2] = valley
-            rows[count, 3] = above
-            rows[count, 4] = below
-            rows[count, 5] = 1.0 if inside and min(left, right) > np.float32(0.4) * max(left, right) else 0.0
-            count += 1
+        for k in range(_turning_points(smooth[b], delta, tops, lows)):
+            top = tops[k]
+            if 1 <= top <= size - 2 and count < capacity:
+                # A valley further than a pitch away is flat ground: its near end counts.
+                above, below = max(lows[k], top - int(pitch)), min(lows[k + 1], top + int(pitch))
+                _describe(smooth[b], top, above, below, pitch, rows[count])
+                count += 1
         start[b + 1] = count
     return start, rows[:count].copy()
