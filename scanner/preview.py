@@ -137,7 +137,10 @@ def _view_panel(picture: Picture, box: Box, scan: Scan) -> None:
     picture[y : y + height, x : x + width] = render(scan.xyz, scan.albedo, (width, height), view)
     side = "right" if view.azimuth_deg > 0 else "left"
     words = f"seen from {abs(view.azimuth_deg):.0f}° to the {side} of the camera, {view.elevation_deg:.0f}° above"
-    text(picture, words, (x + width - 18 - text_width(words, size=15), y + height - 18), size=15, colour=DIM)
+    plate = text_width(words, size=15) + 28
+    corner = picture[y + height - 44 : y + height - 12, x + width - plate - 12 : x + width - 12]
+    corner[:] = cv2.addWeighted(corner, 0.25, np.full_like(corner, PANEL), 0.75, 0)
+    text(picture, words, (x + width - plate + 2, y + height - 22), size=15, colour=DIM)
 
 
 def _view(scan: Scan) -> View:

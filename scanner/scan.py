@@ -313,8 +313,7 @@ def _with_same_normals(scan: Scan, report: Mapping[str, Any]) -> Scan:
 
 
 def _reasons(reason: NDArray[np.uint8]) -> dict[str, int]:
-    counts = np.bincount(reason.ravel(), minlength=len(Reason))
-    return {kind.name.lower(): int(counts[kind]) for kind in Reason}
+    return {kind.name.lower(): int(np.count_nonzero(reason == kind)) for kind in Reason}
 
 
 def _among(kinds: tuple[Reason, ...]) -> Mask:

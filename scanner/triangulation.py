@@ -231,6 +231,14 @@ def _start(row: float, column: float, share: float, direction: Triple, numbers: 
 
 
 @kernel
+def _start_of_row(row: float, direction: Triple, numbers: Numbers) -> float:
+    """`_start` for a row alone."""
+    _, a1, a2 = direction
+    v = (row - numbers[16]) / numbers[15]
+    return (v * numbers[11] - numbers[10]) / (a1 - v * a2)
+
+
+@kernel
 def _step(
     z: float, row: float, column: float, share: float, direction: Triple, numbers: Numbers
 ) -> tuple[float, float]:
@@ -268,11 +276,13 @@ def _along_rows(
         for j in range(width):
             direction = _direction(xs[j], ys[j], numbers)
             row = np.float64(line[j])
-            depth = _start(row, 0.0, 0.0, direction, numbers)
-            depth += _step(depth, row, 0.0, 0.0, direction, numbers)[0]
-            step, square[j] = _step(depth, row, 0.0, 0.0, direction, numbers)
+            depth = _start_of_row(row, direction, numbers)
+            seen, _, slope, _ = _seen(depth, direction, numbers)
+            depth += (row - seen) / slope
+            seen, _, slope, _ = _seen(depth, direction, numbers)
             # Quadratic convergence: after a step of 0.01 px less than 1e-6 px is left.
-            z[j] = depth + step if step * step * square[j] < 1e-4 else np.nan
+            z[j] = depth + (row - seen) / slope if abs(row - seen) < 0.01 else np.nan
+            square[j] = slope * slope
         for j in range(width):
             if math.isnan(z[j]) and not math.isnan(line[j]):
                 direction = _direction(xs[j], ys[j], numbers)
