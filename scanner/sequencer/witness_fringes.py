@@ -22,7 +22,7 @@ from scanner.patterns import PmpPattern
 from scanner.patterns.description import Axis
 from scanner.patterns.pmp import FringeSet
 from scanner.patterns.sequence import BAR_COUNT, bar_light
-from scanner.sequencer.witness import NOISE_SIGMAS, Array, Scene, Witness, sigma_between
+from scanner.sequencer.witness import NOISE_SIGMAS, Array, Scene, Witness, equal_positions, sigma_between
 
 MIN_PIXELS = 150
 """Lit pixels of the thumbnail, fewer than which prove nothing."""
@@ -34,8 +34,9 @@ MAX_DISORDER = 0.15
 """Residual over B, beyond noise, that differs from frame to frame at the same phase, which no response does. Light
 that flickers by 10 % from frame to frame leaves .06, uncorrected gamma 2.3 on a vignetted field .06."""
 
-SWAP_GAIN = 0.35
-"""An exchange of two frames is believed when it brings the residual down to this share of what it was."""
+GAIN_VARIED, GAIN_NARROW = 0.6, 0.35
+"""Another order is believed when it brings the residual down to this share of what it was. In a scene that shows all
+phases no response can look like another order; where it shows few, a bent response at one phase may."""
 
 COPY_SIGMAS = 1.3
 """Two frames that differ by no more than this, over the noise of full-on frames, are one picture."""
@@ -148,12 +149,13 @@ def _residual(scene: Scene, fit: Fit, clipped: NDArray[np.bool_]) -> Witness | N
     design, frames, b = _design(fit.alpha), fit.frames[:, bright], fit.modulation[bright]
     left, noise = _rms(design, frames, b), scene.noise / float(np.median(b))
     limit = MAX_RESIDUAL + noise
-    if left > 3 * noise:
-        if (pair := _exchange(design, frames, b, left)) is not None:
+    gain = GAIN_VARIED if _length(fit, bright) < 0.5 else GAIN_NARROW
+    if left > 1.5 * noise:
+        if (pair := _exchange(design, frames, b, gain * left)) is not None:
             wrong = tuple(sorted(fit.positions[n] for n in pair))
             says = f"{called} fits with frames {wrong[0]} and {wrong[1]} exchanged, and not as it is"
             return Witness(name, False, left, limit, wrong, says)
-        if wrong := _false_shifts(fit, bright, noise):
+        if wrong := _false_shifts(fit, bright, noise, gain):
             says = f"{called}: frames {', '.join(map(str, wrong))} show another shift than their own"
             return Witness(name, False, left, limit, wrong, says)
     if left > limit:
@@ -166,7 +168,7 @@ def _residual(scene: Scene, fit: Fit, clipped: NDArray[np.bool_]) -> Witness | N
     return Witness(name, True, left, limit, says=f"{called} fits a sinusoid")
 
 
-def _false_shifts(fit: Fit, bright: NDArray[np.bool_], noise: float) -> tuple[int, ...]:
+def _false_shifts(fit: Fit, bright: NDArray[np.bool_], noise: float, gain: float) -> tuple[int, ...]:
     """Frames that the others predict for another shift, and not for their own."""
     count = len(fit.positions)
     if count < 5:
@@ -180,7 +182,7 @@ def _false_shifts(fit: Fit, bright: NDArray[np.bool_], noise: float) -> tuple[in
         keep = [i for i in range(count) if i != n]
         found = _solve(_design(fit.alpha[keep]), frames[keep])
         off = [float(np.sqrt(np.median(((row - frames[n]) / b) ** 2))) / 0.6745 for row in _predict(alphas, found)]
-        if off[n] > 4 * noise and min(off) < SWAP_GAIN * off[n]:
+        if off[n] > 2 * noise and min(off) < gain * off[n]:
             wrong.append(fit.positions[n])
     return tuple(wrong)
 
@@ -200,8 +202,8 @@ def _rms(design: NDArray[np.float64], frames: Array, b: Array) -> float:
     return float(np.sqrt(np.median((left**2).sum(axis=0)) / max(len(frames) - 3, 1)))
 
 
-def _exchange(design: NDArray[np.float64], frames: Array, b: Array, left: float) -> tuple[int, int] | None:
-    """The exchange of two frames after which the set fits, if one does and no other does as well."""
+def _exchange(design: NDArray[np.float64], frames: Array, b: Array, below: float) -> tuple[int, int] | None:
+    """The exchange of two frames that leaves the smallest residual, if that is below `below`."""
     stride = max(1, frames.shape[1] // 2000)
     sample, weights = frames[:, ::stride], b[::stride]
     found = []
@@ -210,7 +212,7 @@ def _exchange(design: NDArray[np.float64], frames: Array, b: Array, left: float)
         order[i], order[j] = order[j], order[i]
         found.append((_rms(design, sample[order], weights), (i, j)))
     found.sort()
-    return found[0][1] if found[0][0] < SWAP_GAIN * left else None
+    return found[0][1] if found[0][0] < below else None
 
 
 def _odd_one_out(fit: Fit, bright: NDArray[np.bool_], left: float) -> tuple[int, ...]:
@@ -224,25 +226,30 @@ def _odd_one_out(fit: Fit, bright: NDArray[np.bool_], left: float) -> tuple[int,
         keep = [i for i in range(count) if i != n]
         tried.append((_rms(_design(fit.alpha[keep]), fit.frames[keep][:, bright], b), n))
     best, n = min(tried)
-    return (fit.positions[n],) if best < SWAP_GAIN * left else fit.positions
+    return (fit.positions[n],) if best < GAIN_VARIED * left else fit.positions
 
 
 def _means(scene: Scene, fits: Sequence[Fit], clipped: NDArray[np.bool_]) -> list[Witness]:
-    """Equal mean light of all sets, pixel by pixel: the only check inside a set of three."""
-    if len(fits) < 2:
+    """Equal mean light of all sets, pixel by pixel, and between black and white: the only check inside three shifts."""
+    if not fits:
         return []
     use = np.logical_and.reduce([_bright(scene, fit, clipped) for fit in fits])
-    if np.count_nonzero(use) < MIN_PIXELS:
+    references = _references(scene, use)
+    if np.count_nonzero(use) < MIN_PIXELS or (len(fits) < 2 and references is None):
         return []
     means = np.stack([fit.mean[use] for fit in fits])
-    reference = np.median(means, axis=0) if len(fits) > 2 else means.mean(axis=0)
+    if references is not None:
+        black, span = references
+        means = means - black
+    else:
+        # Of two sets each stands half way to the other's error; of more the median is right.
+        span = np.median(means, axis=0) if len(fits) > 2 else means.mean(axis=0)
     b = np.median(np.stack([fit.modulation[use] for fit in fits]), axis=0)
     # Lamps drift and mains light beats: one gain a set is taken out; disorder differs from pixel to pixel.
-    gains = np.median(means / np.maximum(reference, 1), axis=1, keepdims=True)
-    value = np.sqrt(np.median(((means - gains * reference) / b) ** 2, axis=1)) / 0.6745
+    gains = np.median(means / np.maximum(span, 1), axis=1, keepdims=True)
+    value = np.sqrt(np.median(((means - gains * span) / b) ** 2, axis=1)) / 0.6745
     noise = scene.noise / float(np.median(b)) / np.sqrt([len(fit.positions) for fit in fits])
-    # Of two sets each stands half way to the other's error.
-    limit = MAX_MEAN_DIFFERENCE / (1 if len(fits) > 2 else 2) + 3 * noise
+    limit = MAX_MEAN_DIFFERENCE / (2 if references is None and len(fits) == 2 else 1) + 3 * noise
     wrong = [fits[int(i)] for i in np.flatnonzero(value > limit)]
     frames = tuple(sorted(p for fit in wrong for p in fit.positions))
     worst = int(np.argmax(value / limit))
@@ -250,6 +257,19 @@ def _means(scene: Scene, fits: Sequence[Fit], clipped: NDArray[np.bool_]) -> lis
         return [Witness("equal means", True, float(value[worst]), float(limit[worst]), says="sets have equal means")]
     says = f"{', '.join(_name(fit.fringe_set) for fit in wrong)}: mean light unlike that of the other sets"
     return [Witness("equal means", False, float(value[worst]), float(limit[worst]), frames, says)]
+
+
+def _references(scene: Scene, use: NDArray[np.bool_]) -> tuple[Array, Array] | None:
+    """(black, white - black) over some pixels, from full-off and full-on frames that are not clipped."""
+    levels = {}
+    for light, positions in equal_positions(scene.sequence):
+        here = [scene.frames[p][use] for p in positions if p in scene.frames]
+        if not here:
+            return None
+        levels[light] = np.median(np.stack(here), axis=0).astype(np.float32)
+    span = levels[1.0] - levels[0.0]
+    clipped = float(np.mean(levels[1.0] >= scene.max_value)) if span.size else 1.0
+    return (levels[0.0], span) if clipped < 0.05 and float(np.median(span)) > 0 else None
 
 
 def _copies(scene: Scene, fits: Sequence[Fit]) -> list[Witness]:
@@ -284,8 +304,12 @@ def _copies(scene: Scene, fits: Sequence[Fit]) -> list[Witness]:
 
 def _varied(fit: Fit, use: NDArray[np.bool_]) -> bool:
     """Whether the scene shows enough of the set's phases for two frames not to be alike by chance."""
-    vector = np.exp(2j * np.pi * fit.cycles[use]).mean()
-    return bool(np.abs(vector) < 0.9)
+    return _length(fit, use) < 0.9
+
+
+def _length(fit: Fit, use: NDArray[np.bool_]) -> float:
+    """Length of the mean phase vector: 1 where the scene shows one phase only, 0 where it shows all alike."""
+    return float(np.abs(np.exp(2j * np.pi * fit.cycles[use]).mean()))
 
 
 def _pairs(fit: Fit, later: Fit) -> list[tuple[int, int]]:
@@ -371,7 +395,7 @@ def _remainders(
     if turned and best > score + HYPOTHESIS_GAIN:
         frames = tuple(sorted(p for k in turned for p in fits[k].positions))
         named = " or ".join(f"{fits[k].fringe_set.frequency:g}" for k in turned)
-        says = f"frequency {named} along {axis} is out of step: its frames are rotated or reversed"
+        says = f"frequency {named} along {axis} is out of step: frames are rotated, reversed or those of another set"
         return [Witness(f"remainder {axis}", False, score, best - HYPOTHESIS_GAIN, frames, says)]
     noise2 = [(scene.noise / float(np.median(fit.modulation[use]))) ** 2 * 2 / n / (4 * np.pi**2)
               for fit, n in zip(fits, shifts, strict=True)]  # fmt: skip
@@ -419,7 +443,7 @@ def _agreement(ladder: Ladder, cycles: NDArray[np.float64], centre: float) -> ND
 def _best_turn(
     pattern: PmpPattern, ladder: Ladder, cycles: NDArray[np.float64], centre: float, shifts: Sequence[int]
 ) -> tuple[float, tuple[int, ...]]:
-    """The best agreement that one rotated or reversed set would give, and the sets that could be that one."""
+    """The best agreement that one turned set, or two exchanged ones, would give, and the sets that could be those."""
     sample = cycles[:, :: max(1, cycles.shape[1] // 1500)]
     scores = np.full(len(shifts), -1.0)
     for k, count in enumerate(shifts):
@@ -434,6 +458,15 @@ def _best_turn(
                 vectors = _agreement(ladder, tried, centre)
                 if vectors.real.min() > 0.5:
                     scores[k] = max(scores[k], float(vectors.real.mean()))
+    for k, other in combinations(range(len(shifts)), 2):
+        for direction in (1, -1) if shifts[k] == shifts[other] else ():
+            tried = sample.copy()
+            # Two sets exchanged, or the order of all their frames reversed: n -> N - 1 - n, a turn by -sign.
+            shift = 0.0 if direction == 1 else -pattern.offset / np.pi + pattern.sign / shifts[k]
+            tried[[k, other]] = direction * tried[[other, k]] + shift
+            vectors = _agreement(ladder, tried, centre)
+            if vectors.real.min() > 0.5:
+                scores[[k, other]] = np.maximum(scores[[k, other]], float(vectors.real.mean()))
     best = float(scores.max())
     return best, tuple(int(k) for k in np.flatnonzero((scores > best - 0.05) & (scores > 0)))
 
@@ -465,26 +498,30 @@ def _bars(
         return []
     mean = np.median([fit.mean[use] for fit in fits], axis=0)
     above = (scene.frames[position][use] - mean)[known]
-    here, other, other_at = _best_places(bar[known], above > 0)
+    here, other, other_at = _best_places(bar[known], above > 0, _nearby(fits, ladder))
     name = f"order bars {axis}"
-    if here >= other or here >= MIN_BARS_AGREEMENT:
-        return [Witness(name, True, here, MIN_BARS_AGREEMENT, says=f"{here:.0%} agree with the fringes")]
+    if other >= max(MIN_BARS_AGREEMENT, here + BARS_GAIN):
+        frames = tuple(sorted({position, *(p for fit in fits for p in fit.positions)}))
+        says = (
+            f"{here:.0%} of pixels agree with the order bars along {axis} where the fringes put them, {other:.0%} "
+            f"{other_at}: all sets are rotated or reversed alike"
+        )
+        return [Witness(name, False, here, other - BARS_GAIN, frames, says, whole=True)]
     binary = float(np.mean(np.abs(above) > 0.5 * b[known]))
-    if binary < MIN_BARS_AGREEMENT:
+    if here < MIN_BARS_AGREEMENT and binary < MIN_BARS_AGREEMENT:
         says = "the frame of the order bars shows no bars"
         return [Witness(name, False, here, MIN_BARS_AGREEMENT, (position,), says)]
-    if other < max(MIN_BARS_AGREEMENT, here + BARS_GAIN):
-        return [
-            Witness(
-                name, True, here, MIN_BARS_AGREEMENT, says=f"{here:.0%} agree with the fringes, no other place better"
-            )
-        ]
-    frames = tuple(sorted({position, *(p for fit in fits for p in fit.positions)}))
-    says = (
-        f"{here:.0%} of pixels agree with the order bars along {axis} where the fringes put them, {other:.0%} "
-        f"{other_at}: all sets are rotated or reversed alike"
-    )
-    return [Witness(name, False, here, MIN_BARS_AGREEMENT, frames, says, whole=True)]
+    return [Witness(name, True, here, MIN_BARS_AGREEMENT, says=f"{here:.0%} agree with the fringes, no place more")]
+
+
+def _nearby(fits: Sequence[Fit], ladder: Ladder) -> float:
+    """Bars: half of what one frame's step of any set moves the positions of the first rung, at most `NEARBY`."""
+    moves = [
+        abs(weight) / fit.fringe_set.shifts / ladder.frequencies[0]
+        for weight, fit in zip(ladder.combinations[0], fits, strict=True)
+        if weight
+    ]
+    return float(min(NEARBY, 0.5 * BAR_COUNT * min(moves)))
 
 
 def _trusted(
@@ -502,11 +539,11 @@ def _trusted(
     return fraction, scene.noise / b * weight / ladder.frequencies[rung]
 
 
-def _best_places(bar: NDArray[np.float64], light: NDArray[np.bool_]) -> tuple[float, float, str]:
+def _best_places(bar: NDArray[np.float64], light: NDArray[np.bool_], nearby: float) -> tuple[float, float, str]:
     """Agreement of the bars' light with the places that the fringes give, there and elsewhere.
 
-    Returns (best agreement nearby, best elsewhere, where in words). Nearby is within `NEARBY`:
-    response errors of few shifts bend positions by as much. Edges, where blur decides, count little: they are few.
+    Returns (best agreement nearby, best elsewhere, where in words). Nearby:
+    response errors of few shifts bend positions by so much. Edges, where blur decides, count little: they are few.
     """
     stride = max(1, bar.size // 3000)
     bar, light = bar[::stride], light[::stride]
@@ -517,7 +554,7 @@ def _best_places(bar: NDArray[np.float64], light: NDArray[np.bool_]) -> tuple[fl
             moved = min(offset, BAR_COUNT - offset)
             place = np.floor((base + offset) % BAR_COUNT)
             agrees = float(np.mean((bar_light(place, BAR_COUNT) > 0.5) == light))
-            if not mirrored and moved <= NEARBY:
+            if not mirrored and moved <= nearby:
                 near = max(near, agrees)
             elif agrees > far:
                 far = agrees
