@@ -290,7 +290,7 @@ def _decide(found: _Found, model: PatternModel, clock: _Stages) -> _Decision:
     modulation = emissions.first_modulation(seen, model)
     floor = np.full(model.channels, 0.03, np.float32)
     tables = hmm.transitions(model.stripes)
-    gap = hmm.gaps(peaks.start, peaks.y, found.pitch)
+    gap = hmm.gaps(peaks.start, peaks.y, peaks.height, found.pitch, model.weakest)
     votes = np.zeros((len(peaks), model.stripes), np.float32)
     posterior = votes
     for _ in range(ROUNDS):

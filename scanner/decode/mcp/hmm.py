@@ -24,6 +24,15 @@ MISS = 0.12
 JUMP = 2e-4
 """Probability of any one jump forwards, however long: what bounds the cost of a step of depth."""
 
+EDGE_MISS = 0.5
+EDGE_JUMP = 5e-3
+"""The same where an edge lies between two peaks: only what they show themselves tells how far the stripes jump."""
+
+EDGE_SPACING = 0.27
+EDGE_HEIGHT = 0.4
+"""An edge lies between peaks whose distance is that far from whole pitches, or whose heights are in that ratio. On one
+surface the pitch changes by a tenth over a view (keystone, tilt) and the height with the angle of light."""
+
 BACK = 2e-6
 """Probability of any one jump backwards."""
 
@@ -49,22 +58,37 @@ class Columns:
 
 
 def transitions(stripes: int) -> Array:
-    """(MAX_GAP, S, S) float32: probability from stripe [1] to stripe [2] over a gap of g + 1 pitches."""
+    """(2 MAX_GAP, S, S) float32: probability from stripe [1] to stripe [2] over a gap of g + 1 pitches.
+
+    The first MAX_GAP tables are for one surface, the others for where an edge lies between the two peaks.
+    """
     step = np.arange(stripes)[None, :] - np.arange(stripes)[:, None]
     tables = []
-    for gap in range(1, MAX_GAP + 1):
-        regular = MISS ** np.abs(step - gap) * (1 - MISS)
-        table = np.where(step > 0, np.maximum(regular, JUMP), BACK)
-        tables.append(np.where(step == 0, REPEAT, table))
+    for miss, jump in ((MISS, JUMP), (EDGE_MISS, EDGE_JUMP)):
+        for gap in range(1, MAX_GAP + 1):
+            regular = miss ** np.abs(step - gap) * (1 - miss)
+            table = np.where(step > 0, np.maximum(regular, jump), BACK)
+            tables.append(np.where(step == 0, REPEAT, table))
     return np.ascontiguousarray(tables, np.float32)
 
 
-def gaps(start: Ints, y: Array, pitch: float) -> Ints:
-    """(P,) int32: pitches from the peak before to this one, 1 .. MAX_GAP; 1 for a column's first."""
-    distance = np.diff(y, prepend=np.float32(0))
-    result: Ints = np.clip(np.floor(distance / pitch + 0.35), 1, MAX_GAP).astype(np.int32)
-    firsts = start[:-1][start[:-1] < len(y)]
-    result[firsts] = 1
+def gaps(start: Ints, y: Array, height: Array, pitch: float, weakest: float) -> Ints:
+    """Which table leads from the peak before to this one: (P,) int32, 0 for a column's first.
+
+    Args:
+        start: (B + 1,) int32, where columns begin.
+        y: (P,) px.
+        height: (P,) grey levels.
+        pitch: px.
+        weakest: light of the pattern's dimmest stripe over its brightest: heights may differ by that on one surface.
+    """
+    pitches = np.diff(y, prepend=np.float32(0)) / pitch
+    before = np.concatenate((height[:1], height[:-1]))
+    ratio = np.minimum(height, before) / np.maximum(np.maximum(height, before), 1e-6)
+    edge = (np.abs(pitches - np.rint(pitches)) > EDGE_SPACING) | (ratio < EDGE_HEIGHT * weakest)
+    result: Ints = np.clip(np.floor(pitches + 0.35), 1, MAX_GAP).astype(np.int32) - 1
+    result[edge] += MAX_GAP
+    result[start[:-1][start[:-1] < len(y)]] = 0
     return result
 
 
@@ -74,7 +98,7 @@ def smooth_columns(evidence: Array, start: Ints, gap: Ints, tables: Array, stray
     Args:
         evidence: (P, S) float32, log-likelihoods and votes.
         start: (B + 1,) int32, where columns begin.
-        gap: (P,) int32, pitches to the peak before.
+        gap: of `gaps`.
         tables: of `transitions`.
         stray_log: (P,) float32, log-likelihood of what is seen at a peak that is no stripe.
 
@@ -166,7 +190,7 @@ def _forward_backward(
             if t == 0:
                 moved[0, :] = alpha[0]
             else:
-                _move(alpha[t], tables[gap[first + t] - 1], moved[t])
+                _move(alpha[t], tables[gap[first + t]], moved[t])
             for s in range(states):
                 # The state of a stray peak is that of the peak before it.
                 alpha[t + 1, s] = moved[t, s] * likely[t, s] + alpha[t, s] * lost[t]
@@ -184,7 +208,7 @@ def _forward_backward(
                 posterior[first + t, s] *= scale
             stray[first + t] = bad * scale
             if t > 0:
-                _move(product, turned[gap[first + t] - 1], before)
+                _move(product, turned[gap[first + t]], before)
                 for s in range(states):
                     beta[s] = before[s] + beta[s] * lost[t]
                 _normalise(beta)
@@ -232,7 +256,7 @@ def _viterbi(evidence: Array, start: Ints, gap: Ints, logs: Array, stray_log: Ar
                 best[:] = 0
                 source[:] = np.arange(states)
             else:
-                _best_sources(score, logs[gap[first + t] - 1], best, source)
+                _best_sources(score, logs[gap[first + t]], best, source)
             for s in range(states):
                 taken = best[s] + keep + evidence[first + t, s]
                 passed = score[s] + lose + stray_log[first + t]

@@ -232,10 +232,10 @@ def _describe(line: Array, top: int, above: int, below: int, pitch: np.float32, 
     row[0] = top
     if curve < 0:
         row[0] += np.float32(0.5) * (line[top - 1] - line[top + 1]) / curve
-    # A flank that the border cuts is held to the part of it that is there.
+    # A flank that the border cuts says nothing of its height.
     half = np.float32(0.5) * pitch
-    left /= min(np.float32(1), top / half)
-    right /= min(np.float32(1), (size - 1 - top) / half)
+    left = right if top < half else left
+    right = left if size - 1 - top < half else right
     reach = np.float32(BORDER) * pitch
     inside = top >= reach and top <= size - 1 - reach
     row[1] = line[top] - valley
