@@ -35,9 +35,9 @@ no two independent measurements."""
 NOISE_SIGMAS = 4.0
 """Of the difference of two neighbours: 6 in 100,000 steps on a smooth surface exceed it by chance."""
 
-SPARSE_SHARE = 0.5
-"""If more than this share of all points lies in fragments below the limit, the map is sparse by its method, and its
-points are no specks: the fragment filter then leaves it alone."""
+SPARSE_SHARE = 0.95
+"""If this share of all points lies in fragments below the limit, the map is sparse by its method, and its points are no
+specks: the fragment filter then leaves it alone. A noisy background around one object stays well below it."""
 
 BOX_KEYS = ("xmin:xmax", "ymin:ymax", "zmin:zmax")
 
