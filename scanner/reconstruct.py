@@ -21,6 +21,7 @@ from scanner.devices import Pixels, Truth
 from scanner.errors import CalibrationError, DecodeError
 from scanner.filters import FilterSettings
 from scanner.geometry import Calibration, load_calibration
+from scanner.patterns import McpPattern, PatternSequence, PmpPattern
 from scanner.scan import Scan, build_scan
 from scanner.sequencer import check_capture
 
@@ -148,7 +149,7 @@ class Reconstruction:
 
     def _compared(self, scan: Scan, capture: Capture) -> Scan:
         with self._timed("compare"):
-            comparison = compare(scan, load_truth(capture.path))
+            comparison = compare(scan, load_truth(capture.path), ambiguity_px(self._header.sequence))
         return replace(scan.with_report(truth=comparison.as_dict()), error_map=comparison.picture())
 
     @contextmanager
@@ -177,6 +178,14 @@ def reconstruct(
     for pattern, record in capture.records.items():
         reconstruction.add(pattern, capture.frame(pattern), record.slot)
     return reconstruction.finish(capture, progress)
+
+
+def ambiguity_px(sequence: PatternSequence) -> float | None:
+    """Projector px by which a value is off if its fringe order or stripe is wrong; None where codes have no period."""
+    pattern, projector = sequence.pattern, sequence.projector
+    if isinstance(pattern, PmpPattern):
+        return min(projector.along(axis) for axis in pattern.axes) / max(pattern.frequencies)
+    return pattern.pitch_px(projector) if isinstance(pattern, McpPattern) else None
 
 
 def calibration_for(capture: Capture, given: Path | None = None) -> Calibration | None:
