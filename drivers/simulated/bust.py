@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 CELL_MM = 0.5
 OFF_MM = -25.0
-"""Height where there is no bust: behind its base, which ends the surface"""
+"""Least height: well behind the base, where the surface ends; the steep way down to it is the outline"""
 
 
 @cache
@@ -30,7 +30,7 @@ def relief(height_mm: float, width_mm: float, depth_mm: float) -> HeightField:
     # Drawn on a canvas 190 wide, 260 high, 150 deep, x right, y down from the middle, z towards the viewer.
     u, v = np.meshgrid(x * 190.0 / width_mm, y * 260.0 / height_mm)
     z = _sculpt(u, v)
-    z = np.where(z > 0, z * (depth_mm / z.max()), OFF_MM)
+    z = np.maximum(z * (depth_mm / z.max()), OFF_MM)
     return HeightField(float(x[0]), float(y[0]), REFERENCE_AIM_MM + depth_mm / 2, CELL_MM, np.ascontiguousarray(z))
 
 
@@ -40,51 +40,55 @@ def _sculpt(u: Array, v: Array) -> Array:
     head = _soft_max(_cranium(u, v), _face(u, v), 6.0)
     head = head + _features(u, v) + _hair(u, v)
     whole = _soft_max(_soft_max(head, _ears(u, v), 2.0), body, 5.0)
-    return np.where(_outline(u, v), whole, OFF_MM)
+    return whole - _beyond_outline(u, v)
 
 
 def _cranium(u: Array, v: Array) -> Array:
-    return _ellipsoid(u, v, (0.0, -76.0, 50.0), (49.0, 53.0, 70.0))
+    return _ellipsoid(u, v, (0.0, -72.0, 48.0), (48.0, 53.0, 72.0), 2.0)
 
 
 def _face(u: Array, v: Array) -> Array:
     # The jaw narrows downwards: the half width falls from the cheekbones to the chin.
-    narrowing = 44.0 - 17.0 * _rise(v, -52.0, 12.0)
-    return _ellipsoid(u / narrowing, v, (0.0, -44.0, 52.0), (1.0, 53.0, 67.0))
+    narrowing = 44.0 - 13.0 * _rise(v, -50.0, 10.0)
+    return _ellipsoid(u / narrowing, v, (0.0, -43.0, 46.0), (1.0, 51.0, 73.0), 2.35)
 
 
 def _neck(u: Array, v: Array) -> Array:
-    flare = 29.0 + 0.010 * np.maximum(v - 8.0, 0.0) ** 2
-    column = 22.0 + 40.0 * np.sqrt(np.maximum(1.0 - (u / flare) ** 2, 0.0)) - 3.0 * np.maximum(np.abs(u) - flare, 0.0)
-    column = column + 5.0 * _ridge(u, v, (-33.0, -25.0), (-5.0, 56.0), 5.0)
-    column = column + 5.0 * _ridge(u, v, (33.0, -25.0), (5.0, 56.0), 5.0)
-    return column - 60.0 * _rise(-v, 30.0, 60.0) - 9.0 * _bump(u, v, (0.0, 60.0), (6.0, 6.0))
+    flare = 28.0 + 0.007 * np.maximum(v - 10.0, 0.0) ** 2
+    column = 22.0 + 40.0 * np.sqrt(np.maximum(1.0 - (u / flare) ** 2, 0.0)) - 8.0 * np.maximum(np.abs(u) - flare, 0.0)
+    column = column + 4.5 * _ridge(u, v, (-33.0, -25.0), (-4.0, 50.0), 4.5)
+    column = column + 4.5 * _ridge(u, v, (33.0, -25.0), (4.0, 50.0), 4.5)
+    column = column + 3.0 * _bump(u, v, (0.0, 24.0), (5.0, 7.0))
+    return column - 150.0 * _rise(-v, 20.0, 60.0) - 7.0 * _bump(u, v, (0.0, 52.0), (5.5, 5.0))
 
 
 def _torso(u: Array, v: Array) -> Array:
     # The shoulder line falls outwards; below it the chest comes forward and turns away at the arms.
-    shoulder = 47.0 + 0.0042 * u**2 + 0.16 * np.abs(u)
+    shoulder = 33.0 + 0.0030 * u**2 + 0.20 * np.abs(u)
     below = v - shoulder
-    thick = 66.0 * np.sqrt(np.maximum(1.0 - (np.clip(30.0 - below, 0.0, 30.0) / 30.0) ** 2, 0.0))
-    chest = thick * np.sqrt(np.maximum(1.0 - (np.abs(u) / 104.0) ** 3.2, 0.0)) + 8.0
+    thick = 62.0 * np.sqrt(np.maximum(1.0 - (np.clip(34.0 - below, 0.0, 34.0) / 34.0) ** 2, 0.0))
+    chest = thick * np.sqrt(np.maximum(1.0 - (np.abs(u) / 102.0) ** 3.0, 0.0)) + 8.0
     chest = chest + 0.10 * np.clip(below, 0.0, 60.0)
-    chest = chest + 4.5 * _ridge(u, v, (-9.0, 66.0), (-70.0, 62.0), 4.5)
-    chest = chest + 4.5 * _ridge(u, v, (9.0, 66.0), (70.0, 62.0), 4.5)
+    chest = chest + 4.0 * _ridge(u, v, (-8.0, 57.0), (-66.0, 54.0), 3.6)
+    chest = chest + 4.0 * _ridge(u, v, (8.0, 57.0), (66.0, 54.0), 3.6)
     chest = chest + _drapery(u, v)
     return np.where(below > 0.0, chest, 8.0 + 5.0 * below)
 
 
 def _drapery(u: Array, v: Array) -> Array:
-    """A cloak from the viewer's right shoulder: folds that run down to the left, and their hem."""
-    across = (v - 92.0) * 0.86 + u * 0.50
-    cloth = _rise(across, -2.0, 8.0)
-    fold = np.sin(across / 4.6 + 0.9 * np.sin(u / 23.0) + 0.4 * np.sin(v / 17.0))
-    return cloth * (6.0 + 3.2 * fold)
+    """A cloak from the right of the picture: rolled hem, folds that run down to the left and fan out."""
+    across = (v - 84.0) * 0.85 + u * 0.53 + 4.0 * np.sin(u / 30.0)
+    along = (v - 84.0) * 0.53 - u * 0.85
+    cloth = _rise(across, -3.0, 4.0)
+    spread = across / (1.0 + 0.0035 * along)
+    fold = np.abs(np.sin(spread / 6.8 + 0.35 * np.sin(along / 19.0))) ** 0.8
+    hem = np.exp(-0.5 * ((across - 4.0) / 3.4) ** 2)
+    return cloth * (4.0 + 5.5 * fold) + 3.0 * hem
 
 
 def _features(u: Array, v: Array) -> Array:
     side = np.abs(u)
-    nose = _rise(v, -82.0, -43.0) * (1.0 - _rise(v, -42.0, -35.0))
+    nose = _rise(v, -82.0, -43.0) * (1.0 - _rise(v, -43.0, -34.0))
     width = 4.2 + 2.6 * _rise(v, -75.0, -42.0)
     relief = 21.0 * nose**1.15 * np.exp(-0.5 * (u / width) ** 2)
     relief = relief + 4.0 * _bump(u, v, (0.0, -44.5), (5.0, 4.2)) + 5.5 * _bump(side, v, (7.6, -41.5), (3.4, 3.2))
@@ -119,36 +123,40 @@ def _mouth(u: Array, v: Array) -> Array:
 
 def _ears(u: Array, v: Array) -> Array:
     side = np.abs(u)
-    tilt = side - 0.10 * (v + 62.0)
-    shell = _ellipsoid(tilt, v, (50.0, -62.0, 36.0), (9.0, 18.0, 20.0))
-    hollow = 7.5 * _bump(tilt, v, (50.0, -64.0), (3.2, 8.0))
+    tilt = side + 0.12 * (v + 62.0)
+    shell = _ellipsoid(tilt, v, (49.0, -62.0, 34.0), (8.0, 16.5, 18.0), 2.0)
+    hollow = 7.5 * _bump(tilt, v, (49.5, -64.0), (2.8, 7.5))
     return shell - hollow + 2.0 * _bump(tilt, v, (45.0, -60.0), (2.0, 3.5))
 
 
 def _hair(u: Array, v: Array) -> Array:
-    """Locks combed forward from the crown, in two rows of curls that end on the forehead and before the ears."""
-    hairline = -101.0 + 0.013 * u**2 - 0.000010 * u**4
-    on = np.maximum(_rise(hairline - v, -2.5, 3.0), _rise(np.abs(u), 40.5, 44.0) * _rise(-v, 64.0, 74.0))
-    radius = np.hypot(u, 0.9 * (v + 122.0))
-    angle = np.arctan2(u, v + 124.0)
-    lock = np.sin(13.0 * angle + 0.07 * radius + 0.7 * np.sin(radius / 7.0))
-    curl = np.cos(radius / 5.6 + 1.6 * np.sin(6.5 * angle))
-    return on * (5.0 + 1.9 * lock + 1.3 * curl)
+    """Strands combed forward from behind the crown; a fringe of comma locks on the forehead, down to the ears."""
+    hairline = -97.0 + 0.012 * u**2 - 0.8 * np.cos(u / 2.3)
+    on = np.maximum(_rise(hairline - v, -2.0, 4.5), _rise(np.abs(u), 39.0, 42.5) * _rise(-v, 58.0, 66.0))
+    radius = np.hypot(u, v + 150.0)
+    angle = np.arctan2(u, v + 150.0)
+    sweep = 0.55 * np.sin(radius / 8.5) + 0.3 * np.sin(radius / 3.9 + 9.0 * angle)
+    strand = np.abs(np.sin(15.0 * angle + sweep)) ** 0.6
+    fine = np.abs(np.sin(38.0 * angle + 2.2 * sweep)) ** 0.7
+    fringe = np.exp(-0.5 * ((hairline - v - 5.0) / 5.0) ** 2)
+    return on * (4.5 + 2.6 * strand + 1.0 * fine + 2.5 * fringe)
 
 
-def _outline(u: Array, v: Array) -> NDArray[np.bool_]:
-    """The cut of a portrait bust: a round lower edge under the chest, straight at the canvas's sides."""
-    low = (np.abs(u) / 99.0) ** 2.6 + (np.maximum(v - 52.0, 0.0) / 77.0) ** 2.6
-    return np.asarray(low < 1.0)
+def _beyond_outline(u: Array, v: Array) -> Array:
+    """The cut of a portrait bust, a round lower edge under the chest: a steep fall beyond it, 0 within."""
+    low = (np.abs(u) / 97.5) ** 2.6 + (np.maximum(v - 52.0, 0.0) / 77.0) ** 2.6
+    return 1500.0 * np.maximum(low - 1.0, 0.0)
 
 
 # --- shapes --------------------------------------------------------------------------------------------------------
 
 
-def _ellipsoid(u: Array, v: Array, centre: tuple[float, float, float], radii: tuple[float, float, float]) -> Array:
-    """Front half of an ellipsoid; beyond its outline it falls away steeply."""
-    q = np.hypot((u - centre[0]) / radii[0], (v - centre[1]) / radii[1])
-    return centre[2] + radii[2] * (np.sqrt(np.maximum(1.0 - q**2, 0.0)) - 4.0 * np.maximum(q - 1.0, 0.0))
+def _ellipsoid(
+    u: Array, v: Array, centre: tuple[float, float, float], radii: tuple[float, float, float], power: float
+) -> Array:
+    """Front half of an ellipsoid (power 2) or a squarer body (above); beyond its outline it falls away steeply."""
+    q = (np.abs((u - centre[0]) / radii[0]) ** power + np.abs((v - centre[1]) / radii[1]) ** power) ** (1.0 / power)
+    return centre[2] + radii[2] * (np.sqrt(np.maximum(1.0 - q**2, 0.0)) - 20.0 * np.maximum(q - 1.0, 0.0))
 
 
 def _bump(u: Array, v: Array, centre: tuple[float, float], widths: tuple[float, float]) -> Array:

@@ -16,6 +16,7 @@ import numpy as np
 
 from drivers.simulated.faults import Allowance, chance
 from drivers.simulated.options import Settings
+from drivers.simulated.sensor import deviates
 from drivers.simulated.world import NOMINAL_EXPOSURE_NS, World
 from scanner.devices import (
     CameraCapabilities,
@@ -110,7 +111,7 @@ class SimulatedCamera:
         self._ring_shows: list[float] = []
         self._buffers: list[Pixels] = []
         self._forget_shots()
-        _ = world.view  # cast now: opening a camera may take a second, its first frame may not
+        _ = world.view, world.electrons_per_light, deviates()  # now: opening may take a second, a first frame may not
 
     @property
     def name(self) -> str:
