@@ -1,0 +1,309 @@
+"""Recorded bytes of every message, for clients in other languages: `python -m scanner.wire_vectors docs/reference`.
+
+Writes protocol-vectors.json and the examples in protocol.md between their marks, from the same types as the code.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from scanner.errors import DeviceLost, SyncError
+from scanner.stream import (
+    Ack,
+    Alive,
+    Cancel,
+    DecodedNote,
+    End,
+    Failed,
+    Frame,
+    Identify,
+    Leaving,
+    Progress,
+    Ready,
+    Released,
+    Result,
+    Start,
+    Stop,
+)
+from scanner.wire import (
+    PROTOCOL,
+    Event,
+    FileEntry,
+    Notification,
+    PreviewHeader,
+    Refused,
+    Request,
+    Response,
+    encode,
+    encode_preview,
+    error_body,
+)
+
+JOB = "0b3e3a52-9f0e-4c52-8a55-3f1d8f3b6a11"
+DELIVERY = 1753233956852223
+SHA = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
+BEGIN, END = "<!-- examples: begin -->", "<!-- examples: end -->"
+
+_FILE = FileEntry("scan.npz", 2843430, SHA)
+
+CALLS: tuple[tuple[str, dict[str, Any], Any], ...] = (
+    (
+        "hello",
+        {"protocol": list(PROTOCOL), "client": "example"},
+        {
+            "protocol": list(PROTOCOL),
+            "daemon": {"name": "bench", "version": "0.1.0", "pid": 4711},
+            "features": ["hello", "status", "scan.start"],
+            "limits": {
+                "request_bytes": 1048576,
+                "message_bytes": 8388608,
+                "fetch_bytes": 4194304,
+                "queued_scans": 256,
+            },
+            "endpoints": {
+                "events": "ipc:///run/fringed/events.ipc",
+                "preview": "ipc:///run/fringed/preview.ipc",
+                "live": None,
+                "worker": "ipc:///run/fringed/worker.ipc",
+            },
+        },
+    ),
+    (
+        "status",
+        {},
+        {
+            "number": 41,
+            "name": "bench",
+            "devices": {
+                "camera": {"name": "simulated camera quick/board", "width": 320, "height": 240, "bits": 8},
+                "projector": {
+                    "name": "simulated projector quick/board",
+                    "width": 320,
+                    "height": 240,
+                    "kind": "framebuffer",
+                },
+            },
+            "workers": [{"worker": "rig-812", "pid": 812, "host": "rig", "decode": True, "job": None}],
+            "waiting_for_worker": 0,
+            "jobs": [],
+            "spool": {"bytes": 13508608, "limit_bytes": None, "min_free_bytes": 1000000000},
+        },
+    ),
+    (
+        "devices.list",
+        {},
+        {
+            "devices": [
+                {
+                    "driver": "simulated",
+                    "device": "quick/bust",
+                    "kind": "camera",
+                    "model": "simulated rig quick",
+                    "details": {"width": 320, "height": 240},
+                }
+            ]
+        },
+    ),
+    (
+        "scan.start",
+        {
+            "job_id": JOB,
+            "method": "pmp",
+            "pattern": {"frequencies": [1, 8, 64], "shifts": [8, 8, 8]},
+            "exposure": "auto",
+            "filters": {"edges": True, "depth": [1100.0, 1400.0]},
+        },
+        {
+            "number": 42,
+            "id": JOB,
+            "method": "pmp",
+            "state": "queued",
+            "reason": None,
+            "captured": 0,
+            "total": 0,
+            "stage": "",
+            "created": 1795311639.25,
+            "ended": None,
+            "acknowledged": False,
+            "deleted": False,
+            "error": None,
+        },
+    ),
+    (
+        "scan.status",
+        {"id": JOB},
+        {
+            "number": 57,
+            "id": JOB,
+            "method": "pmp",
+            "state": "acquiring",
+            "reason": None,
+            "captured": 11,
+            "total": 31,
+            "stage": "",
+            "created": 1795311639.25,
+            "ended": None,
+            "acknowledged": False,
+            "deleted": False,
+            "error": None,
+        },
+    ),
+    (
+        "scan.result",
+        {"id": JOB},
+        {
+            "id": JOB,
+            "state": "done",
+            "reason": "completed",
+            "report": {"points": 76800},
+            "files": [msgspec.to_builtins(_FILE)],
+            "error": None,
+        },
+    ),
+    ("scan.fetch", {"id": JOB, "name": "scan.npz", "offset": 0, "length": 4}, b"PK\x03\x04"),
+    ("scan.acknowledge", {"id": JOB}, {"number": 90, "id": JOB, "state": "done", "acknowledged": True}),
+    ("scan.cancel", {"id": JOB}, {"number": 58, "id": JOB, "state": "cancelled", "reason": "cancelled"}),
+    ("scan.list", {}, {"number": 90, "scans": [{"id": JOB, "state": "done"}]}),
+    ("scan.delete", {"id": JOB}, {"number": 91, "id": JOB, "state": "done", "deleted": True}),
+    ("preview.start", {"rate_hz": 10.0, "max_width": 480}, {"endpoint": "ipc:///run/fringed/preview.ipc"}),
+    ("preview.stop", {}, {}),
+    ("shutdown", {}, {}),
+)
+
+EVENTS: tuple[Event, ...] = (
+    Event(42, "queued", JOB, {"state": "queued"}),
+    Event(44, "frame", JOB, {"state": "acquiring", "captured": 11, "total": 31, "retakes": 0}),
+    Event(60, "decoding", JOB, {"state": "decoding", "stage": "triangulating"}),
+    Event(61, "worker.lost", None, {"worker": "rig-812", "why": "ended with status -9"}),
+)
+
+ERRORS: tuple[tuple[str, Response], ...] = (
+    (
+        "error: unknown method",
+        Response(
+            id=7, error=error_body(Refused("unknown method 'scan.begin'", reason="unknown_method", hint="methods: ..."))
+        ),
+    ),
+    (
+        "error: not MessagePack",
+        Response(id=None, error=error_body(Refused("not MessagePack: ...", reason="malformed"))),
+    ),
+    (
+        "error: of a device",
+        Response(id=8, error=error_body(DeviceLost("no answer", device="camera 0", hint="check its cable"))),
+    ),
+    (
+        "error: out of step",
+        Response(id=9, error=error_body(SyncError("frames 7, 8 out of step", frames=(7, 8), hint="longer dwell"))),
+    ),
+)
+
+STREAM: tuple[Struct, ...] = (
+    Ready(protocol=PROTOCOL, worker="rig-812", pid=812, host="rig"),
+    Start(DELIVERY, JOB, f"/spool/{JOB}/capture", f"/spool/{JOB}/scan-{DELIVERY}", {"decoder": "default"}),
+    Frame(DELIVERY, 0, 0, 0, "ok", f"/spool/{JOB}/capture/frames.npy", 128, "c8d3a1f27e5b9064"),
+    Ack(DELIVERY, 4),
+    End(DELIVERY, "completed", 31, []),
+    Progress(DELIVERY, "triangulating"),
+    DecodedNote(DELIVERY, [_FILE], {"points": 76800}),
+    Result(DELIVERY, [_FILE], {"points": 76800}),
+    Failed(DELIVERY, error_body(SyncError("frames 7, 8 out of step", frames=(7, 8)))),
+    Cancel(DELIVERY),
+    Released(DELIVERY),
+    Alive(),
+    Identify(),
+    Leaving(),
+    Stop(),
+)
+
+
+def vectors() -> list[dict[str, str | Any]]:
+    """Every example: {name, direction, message (as JSON), hex}. Bytes in a message are shown as {"bytes": hex}."""
+    found = []
+    for number, (method, params, result) in enumerate(CALLS, start=1):
+        request, response = Request(id=number, method=method, params=params), Response(id=number, result=result)
+        found.append(_vector(f"{method}: call", "client to daemon", request))
+        found.append(_vector(f"{method}: answer", "daemon to client", response))
+    found += [_vector(name, "daemon to client", response) for name, response in ERRORS]
+    found += [_vector(f"event: {event.kind}", "daemon to subscribers", Notification(params=event)) for event in EVENTS]
+    header = PreviewHeader(number=3, width=2, height=2, dtype="uint8", t_ns=1234567890, stride=4)
+    found.append(
+        {
+            "name": "preview",
+            "direction": "daemon to subscribers",
+            "message": {"header": msgspec.to_builtins(header), "pixels": {"bytes": "00407fff"}},
+            "hex": encode_preview(header, bytes([0, 64, 127, 255])).hex(),
+        }
+    )
+    to_daemon = (Ready, Ack, Progress, DecodedNote, Result, Failed, Released, Alive, Leaving)
+    for message in STREAM:
+        direction = "worker to daemon" if isinstance(message, to_daemon) else "daemon to worker"
+        found.append(_vector(f"worker: {message.__struct_config__.tag}", direction, message))
+    return found
+
+
+def as_json() -> str:
+    """protocol-vectors.json."""
+    content = {"format": "fringed-protocol-vectors", "version": 1, "protocol": list(PROTOCOL), "vectors": vectors()}
+    return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+
+
+def as_markdown() -> str:
+    """The examples of protocol.md: message and bytes."""
+    lines = []
+    for vector in vectors():
+        lines += [
+            f"### {vector['name']}",
+            "",
+            f"*{vector['direction']}*",
+            "",
+            "```",
+            json.dumps(vector["message"], ensure_ascii=False),
+            *(vector["hex"][i : i + 96] for i in range(0, len(vector["hex"]), 96)),
+            "```",
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def with_examples(page: str) -> str:
+    """The page with its examples made anew."""
+    before, _, rest = page.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    return f"{before}{BEGIN}\n\n{as_markdown()}\n{END}{after}"
+
+
+def _vector(name: str, direction: str, message: Struct) -> dict[str, Any]:
+    return {
+        "name": name,
+        "direction": direction,
+        "message": _shown(msgspec.to_builtins(message, builtin_types=(bytes,))),
+        "hex": encode(message).hex(),
+    }
+
+
+def _shown(content: Any) -> Any:
+    if isinstance(content, bytes):
+        return {"bytes": content.hex()}
+    if isinstance(content, dict):
+        return {key: _shown(value) for key, value in content.items()}
+    return [_shown(value) for value in content] if isinstance(content, list) else content
+
+
+def main() -> int:
+    """Write the files into the given folder."""
+    folder = Path(sys.argv[1])
+    (folder / "protocol-vectors.json").write_text(as_json(), encoding="utf-8")
+    page = folder / "protocol.md"
+    page.write_text(with_examples(page.read_text(encoding="utf-8")), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
