@@ -35,6 +35,9 @@ ROUGH = np.float32(0.12)
 """Residual of the odd part, as a share of the stripe's height, above which it is no whole stripe: a triangle cut off at
 a third of its flank leaves as much."""
 
+MOST_BEND = 0.3
+"""Change of the pitch from one stripe to the next, in pitches, above which there is a step of depth between them."""
+
 SIGMA_FLOOR = np.float32(0.005)
 """Error that no residual shows: the pattern's own 8 bits, px."""
 
@@ -65,22 +68,9 @@ def refine(reduced: Array, peaks: Peaks, chains: Chains, label: Ints, pitch: flo
     reach = max(3, int(REACH * pitch))
     count = len(peaks)
     y, sigma, whole = peaks.y.copy(), np.full(count, np.float32(0.5)), np.zeros(count, np.uint8)
-    _refine(
-        reduced,
-        guess,
-        peaks.above,
-        peaks.below,
-        peaks.valley,
-        peaks.height,
-        chains.column,
-        runs,
-        ends,
-        reach,
-        y,
-        sigma,
-        whole,
-    )
-    _unstretch(y, peaks.start, label, np.float32(pitch))
+    bend = _bends(guess, peaks.start, label, np.float32(pitch))
+    sides = (peaks.above, peaks.below, peaks.valley, peaks.height)
+    _refine(reduced, guess, *sides, bend, chains.column, runs, ends, reach, y, sigma, whole)
     return Fine(y, sigma, whole)
 
 
@@ -140,11 +130,11 @@ def _room(size: int, g: np.float32, above: np.float32, below: np.float32, reach:
 
 
 @kernel
-def _products(mean: Array, reach: int, limit: int, sums: Array) -> None:
+def _products(mean: Array, reach: int, limit: int, bend: np.float32, sums: Array) -> None:
     """Sums over the window of shift x shift, shift x slope, slope x slope, odd x shift, odd x slope, odd x odd.
 
-    The odd part of the profile `mean` is explained by a shift (the even part's derivative) and a slope of brightness
-    (the even part times the distance).
+    The odd part of the profile `mean`, less what the bend of the surface makes of it, is explained by a shift (the even
+    part's derivative) and a slope of brightness (the even part times the distance).
     """
     sums[:] = 0
     for u in range(1, limit):
@@ -153,6 +143,7 @@ def _products(mean: Array, reach: int, limit: int, sums: Array) -> None:
         slope = np.float32(0.5) * (right + left) * np.float32(u)
         inner, outer = mean[reach + u - 1] + mean[reach - u + 1], mean[reach + u + 1] + mean[reach - u - 1]
         shift = np.float32(0.25) * (inner - outer)
+        odd -= bend * np.float32(u * u) * shift
         sums[0] += shift * shift
         sums[1] += shift * slope
         sums[2] += slope * slope
@@ -176,11 +167,13 @@ def _slope_at(p: int, count: int, kappa: Array, worth: Array) -> np.float32:
     # The scatter along the stripe says how sure it is; windows of 7 columns overlap.
     scatter = max(square / weight - slope * slope, np.float32(0))
     independent = max(np.float32(1), np.float32(hi - lo + 1) / np.float32(2 * HALF_COLUMNS + 1))
-    return slope * (slope * slope / (slope * slope + scatter / independent + np.float32(1e-12)))
+    return slope * (slope * slope / (slope * slope + np.float32(0.25) * scatter / independent + np.float32(1e-12)))
 
 
 @kernel
-def _window_sums(profile: Array, ground: Array, usable: Ints, p: int, count: int, mean: Array, sums: Array) -> int:
+def _window_sums(
+    profile: Array, ground: Array, usable: Ints, p: int, count: int, bend: np.float32, mean: Array, sums: Array
+) -> int:
     """Average the profiles about place `p` of a run, and sum their products; returns the samples used to a side."""
     reach = (profile.shape[1] - 1) // 2
     lo, hi = max(p - HALF_COLUMNS, 0), min(p + HALF_COLUMNS, count - 1)
@@ -192,7 +185,7 @@ def _window_sums(profile: Array, ground: Array, usable: Ints, p: int, count: int
             mean[u] += profile[q, u] - ground[q]
     for u in range(profile.shape[1]):
         mean[u] /= np.float32(hi - lo + 1)
-    _products(mean, reach, limit, sums)
+    _products(mean, reach, limit, bend, sums)
     return limit
 
 
@@ -212,6 +205,7 @@ def _refine(
     below: Array,
     valley: Array,
     height: Array,
+    bend: Array,
     column: Ints,
     runs: Ints,
     ends: Ints,
@@ -234,7 +228,7 @@ def _refine(
             ground[p] = valley[k]
             _straighten(reduced[column[k]], guess[k], reach, profile[p])
         for p in range(count):
-            used[p] = _window_sums(profile, ground, usable, p, count, mean, sums[p])
+            used[p] = _window_sums(profile, ground, usable, p, count, bend[runs[first + p]], mean, sums[p])
             ss, sv, vv, os, ov = sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3], sums[p, 4]
             determinant = ss * vv - sv * sv
             apart = used[p] >= 4 and determinant > np.float32(1e-4) * ss * vv
@@ -258,22 +252,30 @@ def _refine(
 
 
 @kernel
-def _unstretch(y: Array, start: Ints, label: Ints, pitch: np.float32) -> None:
-    """Take off what a change of the local pitch adds to the odd part: the second difference of the neighbours.
+def _bends(y: Array, start: Ints, label: Ints, pitch: np.float32) -> Array:
+    """How the local pitch changes at each peak, from the neighbouring stripes of its column: (P,) float32, 1 / px.
 
-    With u = a t + c t^2 (t in pitches, u in px) the flanks at t^2 = m lie c m off; m is the mean of t^2 over the fit
-    window, REACH^2 / 3.
+    With rows t in pitches, y = y0 + a t + c t^2 about a peak; the figure is c / a^2, so that a flank u px away lies
+    (c / a^2) u^2 further than on a surface of even pitch. A stripe with one neighbour takes the neighbour's figure.
     """
-    moved = np.zeros(len(y), np.float32)
-    m = np.float32(REACH * REACH / 3)
+    bend = np.zeros(len(y), np.float32)
+    known = np.zeros(len(y), np.bool_)
     for b in range(len(start) - 1):
         for k in range(start[b] + 1, start[b + 1] - 1):
             s = label[k]
-            if s < 0 or label[k - 1] != s - 1 or label[k + 1] != s + 1:
+            if s < 1 or label[k - 1] != s - 1 or label[k + 1] != s + 1:
                 continue
             before, after = y[k] - y[k - 1], y[k + 1] - y[k]
-            # A step of depth is no stretch: its second difference is not small beside the pitch.
-            if abs(after - before) < np.float32(0.15) * pitch:
-                moved[k] = np.float32(0.5) * (after - before) * m
-    for k in range(len(y)):
-        y[k] -= moved[k]
+            # A step of depth is no bend: its second difference is not small beside the pitch.
+            if abs(after - before) < np.float32(MOST_BEND) * pitch:
+                half = np.float32(0.5) * (before + after)
+                bend[k] = np.float32(0.5) * (after - before) / (half * half)
+                known[k] = True
+        for k in range(start[b], start[b + 1]):
+            if known[k] or label[k] < 0:
+                continue
+            if k + 1 < start[b + 1] and known[k + 1] and label[k + 1] == label[k] + 1:
+                bend[k] = bend[k + 1]
+            elif k > start[b] and known[k - 1] and label[k - 1] == label[k] - 1:
+                bend[k] = bend[k - 1]
+    return bend
