@@ -78,7 +78,7 @@ class SimulatedCamera:
     """begun, not yet ready"""
     _waiting: deque[_Shot]
     """in the device's buffers"""
-    _prepared: tuple[_Window, Pixels] | None
+    _prepared: tuple[_Window, int, Pixels] | None
     _last_window: _Window | None
     _ordinal: int
     """frames exposed since start"""
@@ -198,7 +198,7 @@ class SimulatedCamera:
             self._collect(self._clock.now_ns())
             if self._waiting:
                 return self._deliver(self._waiting.popleft())
-            coming = self._coming()
+            coming = self._coming(deadline)
             if coming is None or coming.ready_ns > deadline:
                 self._clock.sleep_until(deadline)
                 return None
@@ -269,15 +269,16 @@ class SimulatedCamera:
         self._exposed.append(replace(before, window=shot.window, ready_ns=shot.ready_ns, waits=False))
         return replace(shot, window=before.window)
 
-    def _coming(self) -> _Shot | None:
-        """The shot that will be ready next; FREE: exposures are begun as they are looked at."""
+    def _coming(self, deadline_ns: int) -> _Shot | None:
+        """The shot that will be ready next, if it began before the deadline; FREE: begins those it looks at."""
         while True:
             for shot in self._exposed:
                 if not shot.waits and not shot.lost:
                     return shot
-            if self._mode is not TriggerMode.FREE:
+            begins = self._free_start_ns + self._ordinal * self._period_ns
+            if self._mode is not TriggerMode.FREE or begins > deadline_ns:
                 return None
-            self._expose(self._free_start_ns + self._ordinal * self._period_ns, None)
+            self._expose(begins, None)
 
     def _collect(self, now_ns: int) -> None:
         """Move shots that are ready to the buffers; where those are full, frames are lost."""
@@ -308,14 +309,19 @@ class SimulatedCamera:
     # --- frames --------------------------------------------------------------------------------------------------
 
     def _prepare(self, shot: _Shot) -> None:
-        """Render during the readout: in real time the frame is then there when it is due."""
-        self._clock.sleep_until(max(shot.end_ns, shot.window.start_ns + shot.window.exposure_ns))
-        self._prepared = (shot.window, self._pixels(shot.window))
+        """Render while the exposure runs: in real time the frame is then there when it is due.
+
+        What will shine is known, since one thread at a time calls the devices and this one is here; if a flip comes
+        from elsewhere all the same, the frame is rendered again.
+        """
+        changes = self._world.timeline.changes
+        self._prepared = (shot.window, changes, self._pixels(shot.window))
 
     def _deliver(self, shot: _Shot) -> CameraFrame:
         self._delivered += 1
-        if self._prepared is not None and self._prepared[0] is shot.window:
-            pixels = self._prepared[1]
+        prepared, changes = self._prepared, self._world.timeline.changes
+        if prepared is not None and prepared[0] is shot.window and prepared[1] == changes:
+            pixels = prepared[2]
         else:
             pixels = self._pixels(shot.window)
         self._prepared = None

@@ -84,6 +84,8 @@ class Timeline:
 
     def __init__(self) -> None:
         self.manner = Manner()
+        self.changes = 0
+        """so many so far: who looked ahead sees whether that still holds"""
         self._changes: deque[tuple[float, LoadedImage | None]] = deque([(-np.inf, None)], maxlen=HISTORY)
         self._lock = threading.Lock()
 
@@ -92,6 +94,7 @@ class Timeline:
         with self._lock:
             last = self._changes[-1][0]
             self._changes.append((max(float(t_ns), last), image))
+            self.changes += 1
 
     def between(self, start_ns: float, end_ns: float) -> list[Segment]:
         """The images that shine, wholly or while changing, within [start_ns, end_ns]; in order, one at least."""

@@ -137,6 +137,14 @@ def test_drops_by_chance_are_as_frequent_as_asked() -> None:
     assert 300 / (last + 1) == pytest.approx(0.7, abs=0.1)
 
 
+def test_a_camera_that_drops_everything_only_times_out() -> None:
+    bench = bench_with(camera={"drop_probability": 1.0})
+    bench.start(TriggerMode.FREE, 1_000_000)
+    called = bench.clock.now_ns()
+    assert bench.camera.pop(SECOND_NS) is None
+    assert bench.clock.now_ns() - called == SECOND_NS
+
+
 def stamped(bench: Bench, flips: int) -> list[tuple[int, CameraFrame]]:
     bench.start(TriggerMode.SOFTWARE)
     found = []
