@@ -7,7 +7,8 @@ from scanner.sequencer.audit import CaptureCheck, check_capture
 from scanner.sequencer.exposure import ExposureChoice
 from scanner.sequencer.exposure import auto as auto_exposure
 from scanner.sequencer.latency import measure as measure_latency
-from scanner.sequencer.plan import Mode, Plan, Rig, light_unit_ns, plan
+from scanner.sequencer.plan import Mode, Plan, light_unit_ns, plan
+from scanner.sequencer.rig import Rig
 from scanner.sequencer.run import Acquisition, FinishReason, FrameSink, acquire
 from scanner.sequencer.verify import FrameVerdict, verify
 from scanner.sequencer.witness import Witness, Witnesses, witness

@@ -9,18 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Literal
+from typing import Any
 
 from scanner.devices import (
-    Camera,
     CameraCapabilities,
-    CameraSettings,
     Interval,
-    Projector,
     ProjectorCapabilities,
     ProjectorKind,
     Source,
-    TriggerBoard,
     TriggerMode,
 )
 from scanner.errors import ConfigError
@@ -43,38 +39,6 @@ class Mode(StrEnum):
     """flip, wait for the light, trigger the camera"""
     FREE = "free"
     """the camera runs by itself; the frame that fits into a pattern's time is taken, the others are dropped"""
-
-
-@dataclass(frozen=True)
-class Rig:
-    """The opened devices and what was measured of them.
-
-    `latency` and `settle` are the rig's own measured values and override the projector's; `trigger_mode` None means
-    software trigger where the camera has one, else free run. `mirror` and `rotate` say how the projector hangs: they
-    are applied to each image before it is loaded (mirror first), so that patterns land as described.
-    """
-
-    projector: Projector
-    camera: Camera
-    trigger: TriggerBoard | None = None
-    latency: Interval | None = None
-    settle: Interval | None = None
-    dwell: int | None = None
-    settings: CameraSettings = field(default_factory=CameraSettings)
-    trigger_mode: TriggerMode | None = None
-    mirror: bool = False
-    rotate: Literal[0, 180] = 0
-
-    def plan(self, sequence: PatternSequence, **options: Any) -> Plan:
-        """`plan` with this rig's devices and measured values; options are those of `plan` and go before the rig's."""
-        own: dict[str, Any] = {
-            "latency": self.latency,
-            "settle": self.settle,
-            "dwell": self.dwell,
-            "exposure_ns": self.settings.exposure_ns,
-            "trigger_mode": self.trigger_mode,
-        }
-        return plan(self.projector.capabilities, self.camera.capabilities, sequence, **{**own, **options})
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,17 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Protocol
 
-import numpy as np
-
 from scanner.capture import FrameRecord, Verdict
 from scanner.clock import Clock
-from scanner.devices import Camera, CameraFrame, CameraSettings, Flip, Image, Pixels, Projector, TriggerMode
-from scanner.errors import DecodeError, DeviceLost, ScannerError, SyncError
-from scanner.patterns import FrameRole, PatternSequence
-from scanner.sequencer.plan import Mode, Plan, Rig
+from scanner.devices import Camera, CameraFrame, CameraSettings, Flip, Pixels, Projector, TriggerMode
+from scanner.errors import DeviceLost, ScannerError, SyncError
+from scanner.patterns import PatternSequence
+from scanner.sequencer.disorder import set_of, sync_error
+from scanner.sequencer.plan import Mode, Plan
+from scanner.sequencer.rig import Rig
 from scanner.sequencer.thumbnail import thumbnail
 from scanner.sequencer.verify import FrameVerdict, judge, summary, verify
-from scanner.sequencer.witness import DARK_HINT, Witnesses, witness
+from scanner.sequencer.witness import Witnesses, witness
 
 
 class FrameSink(Protocol):
@@ -139,7 +139,7 @@ def acquire(
     run = _Run(rig, plan, sequence, sink, clock, on_frame, cancelled or _never, on_overrun == "stop")
     try:
         if load:
-            rig.projector.load([oriented(rig, sequence.image(position)) for position in range(len(sequence))])
+            rig.projector.load([rig.oriented(sequence.image(position)) for position in range(len(sequence))])
         run.prepare()
         try:
             if plan.mode is Mode.STATIC:
@@ -153,15 +153,6 @@ def acquire(
     except _Ended as ended:
         return run.finished(ended.reason, ended.error)
     return run.finished(FinishReason.COMPLETED, None)
-
-
-def oriented(rig: Rig, image: Image) -> Image:
-    """An image as this projector must be given it: mirrored and turned as the rig file says."""
-    if rig.mirror:
-        image = image[:, ::-1]
-    if rig.rotate == 180:
-        image = image[::-1, ::-1]
-    return np.ascontiguousarray(image)
 
 
 def _never() -> bool:
@@ -383,41 +374,3 @@ class _Run:
     def out_of_step(self) -> ScannerError:
         suspects = sorted({v.pattern % self.plan.patterns for v in self.verdicts if v.suspect})
         return sync_error(self.sequence, self.verdicts, self.witnesses, suspects, self.retakes)
-
-
-def set_of(sequence: PatternSequence, position: int) -> tuple[int, ...]:
-    """Positions of the frames that must be of one moment with `position`: its fringe set, or itself."""
-    sets = getattr(sequence.pattern, "sets", None)
-    if sets is None or sequence.role(position) is not FrameRole.FRINGE:
-        return (position,)
-    fringes = sequence.fringes
-    index = fringes.index(position)
-    for fringe_set in sets():
-        if fringe_set.first <= index < fringe_set.first + fringe_set.shifts:
-            return fringes[fringe_set.first : fringe_set.first + fringe_set.shifts]
-    return (position,)
-
-
-def sync_error(
-    sequence: PatternSequence,
-    verdicts: Sequence[FrameVerdict],
-    witnesses: Witnesses,
-    suspects: Sequence[int],
-    retakes: int = 0,
-) -> ScannerError:
-    """The error that names the frames, says what spoke against them, and what to do."""
-    if witnesses.dark:
-        return DecodeError("nothing in the camera's view is lit by the projector", hint=DARK_HINT)
-    frames = sorted(set(suspects) | set(witnesses.suspects))
-    if witnesses.whole:
-        frames = list(range(len(sequence)))
-    says = [found.says for found in witnesses.items if not found.passed and found.says]
-    reasons = [reason for verdict in verdicts if verdict.suspect for reason in verdict.reasons[:1]]
-    detail = "; ".join(dict.fromkeys([*says, *reasons])) or "stamps and content contradict the plan"
-    named = f"frame{'s' if len(frames) != 1 else ''} {', '.join(map(str, frames))}"
-    tried = f" after {retakes} retakes" if retakes else ""
-    return SyncError(
-        f"{named} out of step with the projector{tried}: {detail}",
-        frames=frames,
-        hint="measure the projector's latency (fringed calibrate sync), and look at the timing diagram (fringed audit)",
-    )

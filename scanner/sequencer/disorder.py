@@ -1,0 +1,48 @@
+"""What to do about frames in doubt: which frames belong to one moment, and the error that names them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from scanner.errors import DecodeError, ScannerError, SyncError
+from scanner.patterns import FrameRole, PatternSequence
+from scanner.sequencer.verify import FrameVerdict
+from scanner.sequencer.witness import DARK_HINT, Witnesses
+
+
+def set_of(sequence: PatternSequence, position: int) -> tuple[int, ...]:
+    """Positions of the frames that must be of one moment with `position`: its fringe set, or itself."""
+    sets = getattr(sequence.pattern, "sets", None)
+    if sets is None or sequence.role(position) is not FrameRole.FRINGE:
+        return (position,)
+    fringes = sequence.fringes
+    index = fringes.index(position)
+    for fringe_set in sets():
+        if fringe_set.first <= index < fringe_set.first + fringe_set.shifts:
+            return fringes[fringe_set.first : fringe_set.first + fringe_set.shifts]
+    return (position,)
+
+
+def sync_error(
+    sequence: PatternSequence,
+    verdicts: Sequence[FrameVerdict],
+    witnesses: Witnesses,
+    suspects: Sequence[int],
+    retakes: int = 0,
+) -> ScannerError:
+    """The error that names the frames, says what spoke against them, and what to do."""
+    if witnesses.dark:
+        return DecodeError("nothing in the camera's view is lit by the projector", hint=DARK_HINT)
+    frames = sorted(set(suspects) | set(witnesses.suspects))
+    if witnesses.whole:
+        frames = list(range(len(sequence)))
+    says = [found.says for found in witnesses.items if not found.passed and found.says]
+    reasons = [reason for verdict in verdicts if verdict.suspect for reason in verdict.reasons[:1]]
+    detail = "; ".join(dict.fromkeys([*says, *reasons])) or "stamps and content contradict the plan"
+    named = f"frame{'s' if len(frames) != 1 else ''} {', '.join(map(str, frames))}"
+    tried = f" after {retakes} retakes" if retakes else ""
+    return SyncError(
+        f"{named} out of step with the projector{tried}: {detail}",
+        frames=frames,
+        hint="measure the projector's latency (fringed calibrate sync), and look at the timing diagram (fringed audit)",
+    )

@@ -1,0 +1,75 @@
+"""Least-squares fits of fringe sets on thumbnails: what the witnesses of content share.
+
+Plain NumPy over some 20,000 samples; the decoder's own fit, made for every pixel of a scan, is `scanner.decode.pmp`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.patterns import PmpPattern
+from scanner.patterns.pmp import FringeSet
+from scanner.sequencer.witness import NOISE_SIGMAS, Array, Scene
+
+MIN_PIXELS = 150
+"""Lit pixels of the thumbnail, fewer than which prove nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """One set's least-squares fit I_n = A + B cos(theta + alpha_n) over all samples."""
+
+    fringe_set: FringeSet
+    positions: tuple[int, ...]
+    """of the frames that are here"""
+    alpha: NDArray[np.float64]
+    frames: Array
+    """(N, P) grey levels"""
+    mean: Array
+    modulation: Array
+    cycles: Array
+    """(P,) theta / 2 pi"""
+
+    def model(self, n: int) -> Array:
+        """(P,) what frame n should show."""
+        angle = 2 * np.pi * self.cycles + np.float32(self.alpha[n])
+        return np.asarray(self.mean + self.modulation * np.cos(angle), dtype=np.float32)
+
+
+def fit_set(scene: Scene, pattern: PmpPattern, fringe_set: FringeSet) -> Fit | None:
+    """Fit the frames of a set that are here; None if fewer than three are."""
+    fringes = scene.sequence.fringes[fringe_set.first : fringe_set.first + fringe_set.shifts]
+    here = [n for n, p in enumerate(fringes) if p in scene.frames]
+    if len(here) < 3:
+        return None
+    alpha = pattern.sign * 2 * np.pi * np.asarray(here) / fringe_set.shifts + pattern.offset
+    frames = np.stack([scene.frames[fringes[n]] for n in here])
+    mean, cosine, sine = solve(design_matrix(alpha), frames)
+    cycles = np.arctan2(sine, cosine) / np.float32(2 * np.pi)
+    return Fit(fringe_set, tuple(fringes[n] for n in here), alpha, frames, mean, np.hypot(cosine, sine), cycles)
+
+
+def design_matrix(alpha: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 3) rows [1, cos alpha, -sin alpha]: I = [A, B cos theta, B sin theta] . row."""
+    return np.stack([np.ones_like(alpha), np.cos(alpha), -np.sin(alpha)], axis=1)
+
+
+def solve(design: NDArray[np.float64], frames: Array) -> Array:
+    """(3, P) A, B cos theta, B sin theta by least squares."""
+    return np.asarray(np.linalg.pinv(design).astype(np.float32) @ frames)
+
+
+def clipped_pixels(scene: Scene) -> NDArray[np.bool_]:
+    """(P,) samples that saturate in any fringe frame."""
+    top = np.max([scene.frames[p] for p in scene.sequence.fringes if p in scene.frames], axis=0)
+    return np.asarray(top >= scene.max_value)
+
+
+def bright_pixels(scene: Scene, fit: Fit, clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels with a modulation well above its noise, and not clipped."""
+    b = fit.modulation
+    sigma = scene.noise * float(np.sqrt(2 / len(fit.positions)))
+    return scene.lit & ~clipped & (b > NOISE_SIGMAS * sigma) & (b > 0.25 * float(np.quantile(b, 0.99)))
