@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -20,23 +21,26 @@ if TYPE_CHECKING:
 
 
 class ProgressLines:
-    """Stages of a job, one line each; a stage with a known length has a bar.
+    """Stages of a job, one line each; a stage with a known length has a bar. `spent` says how long each took.
 
     On a terminal lines are drawn in place; elsewhere (a log, a pipe) each stage is one plain line when it ends.
     """
 
     def __init__(self, progress: Progress | None) -> None:
+        self.spent: dict[str, float] = {}
+        """seconds by stage, in the order they began; a stage that came again has the sum"""
         self._progress = progress
         self._task: TaskID | None = None
         self._stage = ""
         self._note = ""
+        self._began = 0.0
 
     def stage(self, name: str, total: float | None = None) -> None:
         """Begin a stage; the one before is done. The same name again changes nothing."""
         if name == self._stage:
             return
-        self._end()
-        self._stage, self._note = name, ""
+        self.end()
+        self._stage, self._note, self._began = name, "", time.monotonic()
         if self._progress is not None:
             self._task = self._progress.add_task(name, total=total, note="")
 
@@ -47,15 +51,17 @@ class ProgressLines:
             self._progress.update(self._task, completed=done, total=total, note=note)
 
     def note(self, text: str) -> None:
-        """A line that stays: something a reader will want to know later (a retake, a warning)."""
+        """A line that stays: something a reader will want to know later."""
         if self._progress is not None:
             self._progress.console.print(text, markup=False, highlight=False)
         else:
             print(text, file=sys.stderr, flush=True)
 
-    def _end(self) -> None:
+    def end(self) -> None:
+        """The last stage is done."""
         if not self._stage:
             return
+        self.spent[self._stage] = self.spent.get(self._stage, 0.0) + time.monotonic() - self._began
         if self._progress is not None and self._task is not None:
             task = self._progress.tasks[self._progress.task_ids.index(self._task)]
             total = task.total if task.total is not None else 1
@@ -71,7 +77,7 @@ def progress_lines() -> Iterator[ProgressLines]:
     if not sys.stderr.isatty():
         lines = ProgressLines(None)
         yield lines
-        lines._end()
+        lines.end()
         return
     from rich.console import Console  # noqa: PLC0415  (drawn only here)
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn  # noqa: PLC0415
@@ -86,7 +92,7 @@ def progress_lines() -> Iterator[ProgressLines]:
     with Progress(*columns, console=Console(stderr=True)) as progress:
         lines = ProgressLines(progress)
         yield lines
-        lines._end()
+        lines.end()
 
 
 def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

@@ -33,8 +33,10 @@ def daemon(
     """
     from service.config import load_rig  # noqa: PLC0415
     from service.daemon import run_daemon  # noqa: PLC0415
+    from service.logs import start_logging  # noqa: PLC0415
 
     rig = load_rig(config)
+    start_logging("daemon")
     run_daemon(rig, state_dir=state or _state_folder(), endpoint=connect or rig.daemon.endpoint, lifeline=False)
     return 0
 
@@ -48,8 +50,10 @@ def worker(
     Examples:
       fringed worker --connect ipc:///run/fringed/worker.ipc
     """
+    from service.logs import start_logging  # noqa: PLC0415
     from service.worker import run_worker  # noqa: PLC0415
 
+    start_logging("worker")
     run_worker(connect)
     return 0
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
 from typing import Annotated
@@ -19,8 +18,8 @@ from service.commands.options import (
     OutputFolder,
     filter_members,
 )
-from service.commands.summary import print_summary
-from service.terminal import print_error, print_json, progress_lines
+from service.commands.summary import report_result
+from service.terminal import print_error, progress_lines
 
 
 def decode(
@@ -67,18 +66,12 @@ def decode(
         try:
             made = reconstruct(opened, lens_file, options, lines.stage)
             lines.stage("writing files")
-            names = made.save(folder)
-            report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+            made.save(folder)
         except BaseException:
             if not existed and not any(folder.iterdir()):
                 folder.rmdir()
             raise
-    seconds = time.monotonic() - began
     if made.xyz is None:
         print_error("no calibration: values are decoded, but no points", "--calibration FILE", label="warning")
-    if as_json:
-        files = [str(folder / name) for name in names]
-        print_json({"folder": str(folder), "seconds": round(seconds, 3), "files": files, "report": report})
-    else:
-        print_summary(folder, report, seconds)
+    report_result(folder, time.monotonic() - began, lines.spent, as_json=as_json)
     return 0

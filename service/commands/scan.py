@@ -32,8 +32,8 @@ from service.commands.options import (
     Shifts,
     filter_members,
 )
-from service.commands.summary import print_summary
-from service.terminal import ProgressLines, print_json, progress_lines
+from service.commands.summary import report_result
+from service.terminal import ProgressLines, progress_lines
 
 if TYPE_CHECKING:
     from scanner.client import Client
@@ -102,13 +102,9 @@ def scan(
     folder = output or Path(datetime.now().astimezone().strftime("scan-%Y%m%d-%H%M%S"))
     began = time.monotonic()
     with _output(folder, force=force), progress_lines() as lines, _daemon(rig, connect, lines) as endpoint:
-        report = _scan(endpoint, method, params, folder, lines)
-    seconds = time.monotonic() - began
-    files = sorted(str(path) for path in folder.rglob("*") if path.is_file())
-    if as_json:
-        print_json({"folder": str(folder), "seconds": round(seconds, 3), "files": files, "report": report})
-    else:
-        print_summary(folder, report, seconds)
+        _scan(endpoint, method, params, folder, lines)
+        lines.stage("ending")
+    report_result(folder, time.monotonic() - began, lines.spent, as_json=as_json)
     return 0
 
 
@@ -157,18 +153,15 @@ def _daemon(rig: str | None, connect: str | None, lines: ProgressLines) -> Itera
         yield endpoint
 
 
-def _scan(
-    endpoint: str, method: Method, params: Mapping[str, Any], folder: Path, lines: ProgressLines
-) -> dict[str, Any]:
-    """Start the job, follow it, fetch its files into place; returns the report."""
+def _scan(endpoint: str, method: Method, params: Mapping[str, Any], folder: Path, lines: ProgressLines) -> None:
+    """Start the job, follow it, fetch its files into place."""
     from scanner.client import Client  # noqa: PLC0415
     from scanner.session import raise_unless_done  # noqa: PLC0415
 
     with Client(endpoint, name="fringed scan") as client:
         job_id = client.start_scan(method.value, **params)
         try:
-            outcome = client.wait(job_id, _follower(lines))
-            raise_unless_done(outcome)
+            raise_unless_done(client.wait(job_id, _follower(lines)))
             lines.stage("fetching files")
             incoming = folder / INCOMING
             client.fetch(job_id, incoming, lambda _, done, total: lines.advance(done, total))
@@ -176,7 +169,6 @@ def _scan(
             _cancel(client, job_id)
             raise
     _into_place(incoming, folder)
-    return dict(outcome["report"])
 
 
 def _follower(lines: ProgressLines) -> Callable[[Event], None]:
@@ -194,11 +186,12 @@ def _follower(lines: ProgressLines) -> Callable[[Event], None]:
                 lines.stage("capturing", total)
                 lines.advance(done, total, f"{done} of {total} frames")
             case "retake":
-                lines.note(f"retake: {fields.get('reason') or fields.get('frames') or ''}".rstrip(": "))
-            case "decoding" | "acquired":
-                lines.stage(str(fields.get("stage") or "decoding"))
-            case "decoded":
-                lines.stage("writing files")
+                lines.note(f"{fields.get('retakes', 'some')} frames so far were out of step and taken again")
+            case "acquired":
+                lines.stage("decoding")
+            case "decoding":
+                stage = str(fields.get("stage") or "decoding")
+                lines.stage("writing files" if stage.startswith("wrote ") else stage)
 
     return follow
 

@@ -1,36 +1,16 @@
-"""The short table at the end of a scan or a decode: points, coverage, time per stage, where the files are."""
+"""What a scan or a decode says at its end: points, coverage, time per stage, where the files are."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from service.terminal import print_error, print_facts
+from service.terminal import print_error, print_facts, print_json
 
-SHOWN_MS = 100
-"""Stages shorter than this go together under "other"."""
-
-
-def print_summary(folder: Path, report: Mapping[str, Any], seconds: float) -> None:
-    """Print the table, and the report's warnings on standard error."""
-    facts: list[tuple[str, str]] = [("points", f"{report.get('points', 0):,}")]
-    coverage = report.get("coverage") or {}
-    if "lit" in coverage:
-        facts.append(("coverage", f"{coverage['lit']:.1%} of lit pixels"))
-    if spread := report.get("depth_mm"):
-        facts.append(("depth", _spread(spread)))
-    removed = {name: count for name, count in (report.get("removed") or {}).items() if count}
-    if removed:
-        facts.append(("filtered", ", ".join(f"{count:,} {name}" for name, count in removed.items())))
-    facts += _truth(report.get("truth") or {})
-    facts.append(("time", f"{seconds:.1f} s"))
-    facts += [(f"  {stage}", f"{spent:.2f} s") for stage, spent in _stages(report.get("timings") or {})]
-    facts += [(name, str(folder / file)) for name, file in _FILES if (folder / file).exists()]
-    print_facts("scan", facts)
-    for warning in report.get("warnings") or ():
-        print_error(warning, label="warning")
-
+LEAST_S = 0.1
+"""Stages shorter than this are not listed."""
 
 _FILES = (
     ("picture", "preview.png"),
@@ -42,17 +22,36 @@ _FILES = (
 )
 
 
-def _spread(spread: Mapping[str, float]) -> str:
-    values = list(spread.values())
-    return f"{values[0]:.1f} .. {values[-1]:.1f} mm (1st to 99th percentile)"
+def report_result(folder: Path, seconds: float, stages: Mapping[str, float], *, as_json: bool) -> None:
+    """Print the table, or the JSON document, of a scan's folder. stages: seconds by stage, as the user waited."""
+    report: dict[str, Any] = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    if as_json:
+        files = sorted(str(path) for path in folder.rglob("*") if path.is_file())
+        spent = {stage: round(time, 3) for stage, time in stages.items()}
+        print_json(
+            {"folder": str(folder), "seconds": round(seconds, 3), "stages": spent, "files": files, "report": report}
+        )
+        return
+    facts: list[tuple[str, str]] = [("points", f"{report.get('points', 0):,}"), *_quality(report)]
+    facts.append(("time", f"{seconds:.1f} s"))
+    facts += [(f"  {stage}", f"{time:.1f} s") for stage, time in stages.items() if time >= LEAST_S]
+    facts += [(name, str(folder / file)) for name, file in _FILES if (folder / file).exists()]
+    print_facts("scan", facts)
+    for warning in report.get("warnings") or ():
+        print_error(warning, label="warning")
 
 
-def _stages(timings: Mapping[str, float]) -> list[tuple[str, float]]:
-    shown = [(stage, spent) for stage, spent in timings.items() if spent * 1e3 >= SHOWN_MS]
-    rest = sum(timings.values()) - sum(spent for _, spent in shown)
-    return [*shown, ("other", rest)] if timings else []
-
-
-def _truth(truth: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Figures of the comparison with truth that are single numbers."""
-    return [(f"truth: {name}", f"{value:.4g}") for name, value in truth.items() if isinstance(value, int | float)]
+def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    facts = []
+    if (lit := (report.get("coverage") or {}).get("lit")) is not None:
+        facts.append(("coverage", f"{lit:.1%} of lit pixels"))
+    if spread := report.get("depth_mm"):
+        facts.append(("depth", f"{spread['p1']:.1f} .. {spread['p99']:.1f} mm (1st to 99th percentile)"))
+    if removed := {name: count for name, count in (report.get("removed") or {}).items() if count}:
+        facts.append(("filtered", ", ".join(f"{count:,} {name}" for name, count in removed.items())))
+    inside = (report.get("truth") or {}).get("inside") or {}
+    if error := inside.get("depth_mm"):
+        facts.append(("depth error", f"{error['rms']:.3f} mm rms, {error['p99']:.3f} mm in 99 of 100 points"))
+    if (wrong := inside.get("wrong")) is not None:
+        facts.append(("wrong", f"{wrong:,} points on a wrong fringe or stripe"))
+    return facts

@@ -1,0 +1,113 @@
+"""`fringed scan` as a process: from nothing to files, interrupted, refused, and against a running daemon."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from scanner.capture import Capture
+from scanner.scan import load_scan
+
+FRINGED = (sys.executable, "-c", "import sys; from service.cli import main; sys.exit(main())")
+SCAN_FILES = {"scan.npz", "cloud.ply", "preview.png", "report.json", "capture"}
+PATIENCE_S = 30.0
+
+
+def fringed(*words: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*FRINGED, *map(str, words)], capture_output=True, text=True, check=False, timeout=2 * PATIENCE_S
+    )
+
+
+@contextmanager
+def running(*words: Any) -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(
+        [*FRINGED, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as it:
+        try:
+            yield it
+        finally:
+            it.kill()
+
+
+def test_a_scan_from_nothing_to_files_and_again(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    words = ("scan", "--rig", "simulated:quick/board", "--shifts", "4", "-o", folder)
+    ran = fringed(*words, "--compare-truth", "--json")
+    assert ran.returncode == 0, ran.stderr
+    result = json.loads(ran.stdout)
+    assert {path.name for path in folder.iterdir()} == SCAN_FILES | {"error_map.png"}
+    assert result["report"]["truth"]["inside"]["wrong"] == 0
+    assert "capturing" in ran.stderr
+    assert load_scan(folder).points.shape == (result["report"]["points"], 3)
+    capture = Capture.open(folder / "capture")
+    assert capture.header.state == "complete"
+    assert capture.missing == ()
+    # A second scan into the same folder is refused, or takes the first one's place without leaving anything of it.
+    refused = fringed(*words)
+    assert (refused.returncode, refused.stdout) == (1, "")
+    assert "--force" in refused.stderr
+    again = fringed(*words, "--force")
+    assert again.returncode == 0, again.stderr
+    assert "cloud.ply" in again.stdout
+    assert {path.name for path in folder.iterdir()} == SCAN_FILES
+    assert Capture.open(folder / "capture").header.id != capture.header.id
+    # What was captured decodes again, to the same rows.
+    assert fringed("decode", folder / "capture", "-o", tmp_path / "again").returncode == 0
+    audited = fringed("audit", folder / "capture", "-o", tmp_path / "timing.svg", "--json")
+    assert audited.returncode == 0, audited.stderr
+    assert json.loads(audited.stdout)["passed"]
+    assert (tmp_path / "timing.svg").read_text().lstrip().startswith("<")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_scan_told_to_stop_leaves_nothing(number: signal.Signals, status: int, tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "out"
+    with running("scan", "--rig", "simulated:quick/board", "--repeat", "20", "-o", folder) as scan:
+        assert scan.stderr is not None
+        for line in scan.stderr:
+            if line.startswith("preparing"):  # frames are being taken
+                break
+        scan.send_signal(number)
+        out, _ = scan.communicate(timeout=PATIENCE_S)
+    assert scan.returncode == status
+    assert out == ""
+    assert not (tmp_path / "deep").exists()
+
+
+@pytest.mark.parametrize(
+    ("rig", "said"),
+    [("simulated:quick/nowhere", "nowhere"), ("simulated:quick/board?speed=3", "speed"), ("lost.toml", "lost.toml")],
+)
+def test_a_rig_that_is_not_there_is_named(rig: str, said: str, tmp_path: Path) -> None:
+    ran = fringed("scan", "--rig", rig, "-o", tmp_path / "out", "--json")
+    assert ran.returncode == 1
+    assert said in ran.stderr
+    assert said in json.loads(ran.stdout)["error"]["message"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_running_daemon_is_asked_for_scans(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/control.ipc"
+    with running("daemon", "simulated:quick/board", "--endpoint", endpoint, "--state", tmp_path / "state") as daemon:
+        deadline = time.monotonic() + PATIENCE_S
+        while (asked := fringed("status", "--connect", endpoint, "--json")).returncode:
+            assert "fringed daemon" in asked.stderr
+            assert time.monotonic() < deadline
+        for method in ("mcp", "gray"):
+            ran = fringed("scan", "--connect", endpoint, "--method", method, "-o", tmp_path / method, "--json")
+            assert ran.returncode == 0, ran.stderr
+            assert json.loads(ran.stdout)["report"]["points"] > 10_000
+        scans = json.loads(fringed("status", "--connect", endpoint, "--json").stdout)["scans"]
+        assert [scan["state"] for scan in scans] == ["done", "done"]
+        assert fringed("status", "--connect", endpoint).returncode == 0
+        daemon.send_signal(signal.SIGTERM)
+        daemon.communicate(timeout=PATIENCE_S)
+    assert daemon.returncode == 0
