@@ -10,6 +10,7 @@ from scanner.sequencer.latency import measure as measure_latency
 from scanner.sequencer.plan import Mode, Plan, light_unit_ns, plan
 from scanner.sequencer.rig import Rig
 from scanner.sequencer.run import Acquisition, FinishReason, FrameSink, acquire
+from scanner.sequencer.timing_diagram import timing_diagram
 from scanner.sequencer.verify import FrameVerdict, verify
 from scanner.sequencer.witness import Witness, Witnesses, witness
 
@@ -31,6 +32,7 @@ __all__ = [
     "light_unit_ns",
     "measure_latency",
     "plan",
+    "timing_diagram",
     "verify",
     "witness",
 ]
