@@ -14,6 +14,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drivers.simulated.camera_settings import (
+    EXPOSURE_MAX_NS,
+    EXPOSURE_MIN_NS,
+    EXPOSURE_STEP_NS,
+    GAIN_MAX_DB,
+    Taken,
+    checked,
+)
 from drivers.simulated.faults import Allowance, chance
 from drivers.simulated.options import Settings
 from drivers.simulated.sensor import deviates
@@ -32,12 +40,8 @@ from scanner.devices import (
 from scanner.errors import ConfigError, DeviceBusy, DeviceError, DeviceLost
 from scanner.geometry import Calibration
 
-EXPOSURE_MIN_NS, EXPOSURE_MAX_NS, EXPOSURE_STEP_NS = 10_000, 1_000_000_000, 1_000
-GAIN_MAX_DB = 24.0
 STAMP_BOUND_NS = 1000
 """Stamps are true to this; the error in it is drawn anew for every frame"""
-
-PIXEL_FORMATS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
 
 _RANDOM_USE = 2
 _FAULT_USE = 3
@@ -100,9 +104,8 @@ class SimulatedCamera:
         self._allowance = Allowance(self._faults.times)
         self._trigger_latency_ns = 1e3 * self._options.trigger_latency_us * self._random.uniform(0.9, 1.1)
         self._free_phase = self._random.uniform()
-        self._exposure_ns = NOMINAL_EXPOSURE_NS // EXPOSURE_STEP_NS * EXPOSURE_STEP_NS
-        self._gain_db = 0.0
-        self._bits = world.settings.optics.bits
+        exposure = NOMINAL_EXPOSURE_NS // EXPOSURE_STEP_NS * EXPOSURE_STEP_NS
+        self._taken = Taken(exposure, 0.0, world.settings.optics.bits)
         self._mode: TriggerMode | None = None
         self._open = True
         self._numbers = 0
@@ -126,7 +129,7 @@ class SimulatedCamera:
         return CameraCapabilities(
             width=width,
             height=height,
-            bits=self._bits,
+            bits=self._taken.bits,
             shutter="rolling" if self._rolling else "global",
             readout_ns=self._readout_ns,
             exposure_min_ns=EXPOSURE_MIN_NS,
@@ -145,17 +148,14 @@ class SimulatedCamera:
         self._check_open()
         if self._mode is not None:
             raise DeviceBusy("settings change while the camera is stopped", device=self._name, hint="stop it first")
-        exposure = self._checked_exposure(settings.exposure_ns)
-        gain = self._checked_gain(settings.gain_db)
-        bits = self._checked_format(settings.pixel_format)
-        self._check_region(settings.region)
-        if bits != self._bits:
-            self._buffers, self._ring = [], []
-        if (exposure, gain) != (self._exposure_ns, self._gain_db):
-            self._ring = []
-        self._exposure_ns, self._gain_db, self._bits = exposure, gain, bits
         width, height = self._world.rig.calibration.camera.size
-        return CameraSettings(exposure, gain, _format_name(bits), (0, 0, width, height))
+        taken = checked(settings, self._taken, (width, height), self._name)
+        if taken.bits != self._taken.bits:
+            self._buffers = []
+        if taken != self._taken:
+            self._ring = []
+        self._taken = taken
+        return CameraSettings(taken.exposure_ns, taken.gain_db, taken.pixel_format, (0, 0, width, height))
 
     def start(self, mode: TriggerMode) -> None:
         """Begin to acquire; see `scanner.devices.Camera.start`."""
@@ -240,9 +240,9 @@ class SimulatedCamera:
             stamp += faults.stamp_lie_ns
         lost = ordinal in faults.drop or chance(self._fault_random, faults.drop_probability)
         lost = lost and self._allowance.take("drop")
-        window = _Window(start_ns, self._exposure_ns, self._numbers)
+        window = _Window(start_ns, self._taken.exposure_ns, self._numbers)
         self._numbers += 1
-        end = start_ns + self._exposure_ns + (self._readout_ns if self._rolling else 0)
+        end = start_ns + self._taken.exposure_ns + (self._readout_ns if self._rolling else 0)
         shot = _Shot(
             window,
             stamp,
@@ -257,7 +257,7 @@ class SimulatedCamera:
         if ordinal in faults.double and self._last_window is not None and self._allowance.take("double"):
             shot = replace(shot, window=self._last_window)
         self._last_window = window
-        self._idle_ns = start_ns + self._exposure_ns + self._gap_ns
+        self._idle_ns = start_ns + self._taken.exposure_ns + self._gap_ns
         self._frame_id += 0 if lost and faults.drop_hides_id else 1
         self._exposed.append(self._swapped(shot))
 
@@ -328,7 +328,7 @@ class SimulatedCamera:
         if shot.incomplete:
             pixels = pixels.copy()
             pixels[pixels.shape[0] // 2 :] = 0
-        length = self._exposure_ns + (self._readout_ns if self._rolling else 0)
+        length = self._taken.exposure_ns + (self._readout_ns if self._rolling else 0)
         exposure = Exposure(shot.stamp_ns, shot.stamp_ns + length, STAMP_BOUND_NS, Source.HARDWARE)
         return CameraFrame(pixels, shot.frame_id, exposure, not shot.incomplete, shot.trigger)
 
@@ -344,30 +344,32 @@ class SimulatedCamera:
 
     def _render(self, window: _Window, out: Pixels) -> None:
         readout = self._readout_ns if self._rolling else 0
-        self._world.render(window.start_ns, window.exposure_ns, readout, self._gain_db, self._bits, window.number, out)
+        self._world.render(
+            window.start_ns, window.exposure_ns, readout, self._taken.gain_db, self._taken.bits, window.number, out
+        )
 
     def _empty_frame(self) -> Pixels:
         width, height = self._world.rig.calibration.camera.size
-        if self._bits <= 8:
+        if self._taken.bits <= 8:
             return np.empty((height, width), dtype=np.uint8)
         return np.empty((height, width), dtype=np.uint16)
 
     def _fill_ring(self) -> None:
         """Render the ring's frames, of what shone during the last exposure's time, unless that is what they show."""
-        start = self._clock.now_ns() - self._exposure_ns
-        shows = [segment.on_ns for segment in self._world.timeline.between(start, start + self._exposure_ns)]
+        start = self._clock.now_ns() - self._taken.exposure_ns
+        shows = [segment.on_ns for segment in self._world.timeline.between(start, start + self._taken.exposure_ns)]
         if len(self._ring) == self._options.ring and shows == self._ring_shows:
             return
         self._ring, self._ring_shows = [], shows
         for number in range(self._options.ring):
             frame = self._empty_frame()
-            self._render(_Window(start, self._exposure_ns, number), frame)
+            self._render(_Window(start, self._taken.exposure_ns, number), frame)
             self._ring.append(frame)
 
     def _next_of_ring(self) -> CameraFrame:
         """A frame of the ring at once; its stamps follow one another without overlap, however fast it is asked."""
         now = self._clock.now_ns()
-        start = max(now - self._exposure_ns, self._idle_ns)
+        start = max(now - self._taken.exposure_ns, self._idle_ns)
         end = max(now, start)
         self._idle_ns = end
         pixels = self._ring[self._ordinal % len(self._ring)]
@@ -394,7 +396,7 @@ class SimulatedCamera:
     @property
     def _period_ns(self) -> int:
         """Between the starts of two free-running exposures."""
-        shortest = self._exposure_ns + self._gap_ns
+        shortest = self._taken.exposure_ns + self._gap_ns
         asked = self._options.period_us
         return shortest if asked is None else max(round(1e3 * asked), 1 if self._options.ring else shortest)
 
@@ -410,43 +412,3 @@ class SimulatedCamera:
         if self._faults.unplug_after is not None and self._delivered >= self._faults.unplug_after:
             self._mode = None
             raise DeviceLost("the camera went away", device=self._name, hint="plug it in again and repeat the scan")
-
-    def _checked_exposure(self, exposure_ns: int | None) -> int:
-        if exposure_ns is None:
-            return self._exposure_ns
-        if not EXPOSURE_MIN_NS <= exposure_ns <= EXPOSURE_MAX_NS:
-            raise ConfigError(
-                f"exposure {exposure_ns / 1e3:g} us lies outside "
-                f"{EXPOSURE_MIN_NS / 1e3:g} .. {EXPOSURE_MAX_NS / 1e3:g} us",
-                device=self._name,
-            )
-        return exposure_ns // EXPOSURE_STEP_NS * EXPOSURE_STEP_NS
-
-    def _checked_gain(self, gain_db: float | None) -> float:
-        if gain_db is None:
-            return self._gain_db
-        if not 0.0 <= gain_db <= GAIN_MAX_DB:
-            raise ConfigError(f"gain {gain_db:g} dB lies outside 0 .. {GAIN_MAX_DB:g} dB", device=self._name)
-        return float(gain_db)
-
-    def _checked_format(self, pixel_format: str | None) -> int:
-        if pixel_format is None:
-            return self._bits
-        if pixel_format not in PIXEL_FORMATS:
-            raise ConfigError(
-                f"no pixel format {pixel_format!r}", device=self._name, hint=f"it has {', '.join(PIXEL_FORMATS)}"
-            )
-        return PIXEL_FORMATS[pixel_format]
-
-    def _check_region(self, region: tuple[int, int, int, int] | None) -> None:
-        width, height = self._world.rig.calibration.camera.size
-        if region is not None and tuple(region) != (0, 0, width, height):
-            raise ConfigError(
-                f"region {list(region)} is not offered",
-                device=self._name,
-                hint=f"the simulated camera gives its whole sensor, [0, 0, {width}, {height}]",
-            )
-
-
-def _format_name(bits: int) -> str:
-    return f"Mono{bits}"

@@ -45,6 +45,7 @@ class SimulatedProjector:
         self._images: list[LoadedImage] = []
         self._shown: list[int] = []
         self._delay = 0
+        self._last_index = -1
         self._last_vblank = -1
         self._flips_since_open = 0
         self._open = True
@@ -83,6 +84,7 @@ class SimulatedProjector:
         self._images = [LoadedImage(np.asarray(image)) for image in images]
         self._shown = []
         self._delay = 0
+        self._last_index = -1
 
     def show(self, index: int) -> Flip:
         """Flip at the next vertical blank; see `scanner.devices.Projector.show`."""
@@ -114,6 +116,9 @@ class SimulatedProjector:
     def _change(self, t_ns: int, index: int) -> None:
         """Put the change of light of this flip onto the timeline, as far as faults let it."""
         ordinal = len(self._shown)
+        if index <= self._last_index:
+            self._delay = 0  # the host has begun again, or goes back: what was queued is gone
+        self._last_index = index
         wanted = displayed_index(self._faults, index, len(self._images))
         if wanted != index and not self._allowance.take("order"):
             wanted = index

@@ -21,6 +21,9 @@ from drivers.simulated.optics import Image, Light, Plane, flat_axis, grid_of_lig
 HISTORY = 4096
 """Changes remembered: more than any camera's buffers reach back"""
 
+BEGINNING_NS = -1e18
+"""Dark since then: before any clock's time, and finite, so that differences are numbers"""
+
 
 class LoadedImage:
     """One image in the projector's memory, and its light once somebody looked."""
@@ -86,7 +89,7 @@ class Timeline:
         self.manner = Manner()
         self.changes = 0
         """so many so far: who looked ahead sees whether that still holds"""
-        self._changes: deque[tuple[float, LoadedImage | None]] = deque([(-np.inf, None)], maxlen=HISTORY)
+        self._changes: deque[tuple[float, LoadedImage | None]] = deque([(BEGINNING_NS, None)], maxlen=HISTORY)
         self._lock = threading.Lock()
 
     def show(self, t_ns: int, image: LoadedImage | None) -> None:

@@ -66,6 +66,12 @@ def test_wrong_images(faults: dict[str, object], expected: list[int]) -> None:
     assert seen == expected
 
 
+def test_a_doubled_flip_is_over_when_the_host_begins_again() -> None:
+    bench = bench_with(projector={"double": [3]})
+    assert shown(bench, range(6)) == [0, 1, 2, 2, 3, 4]
+    assert shown(bench, range(6)) == [0, 1, 2, 3, 4, 5]
+
+
 def test_a_permutation_that_shows_what_is_not_loaded_is_refused() -> None:
     with pytest.raises(ConfigError, match="shows image 9"):
         displayed_index(ProjectorFaults(permute=(9,)), 0, 3)

@@ -158,6 +158,18 @@ def test_a_change_within_an_exposure_gives_a_blended_frame(share: float) -> None
     assert (seen - black * scale) / ((white - black) * scale) == pytest.approx(1 - share, abs=2e-3)
 
 
+@pytest.mark.parametrize("options", ["shutter=global", "shutter=rolling", "scan=rows", "modulation=pwm"])
+def test_the_first_image_may_come_within_an_exposure(options: str) -> None:
+    bench = Bench(f"quick/board?noise=false&bits=12&{options}")
+    bench.greys(255)
+    bench.start(TriggerMode.SOFTWARE, 100_000_000)
+    dark = mean_of(bench.shot().pixels)
+    bench.clock.sleep_until(bench.clock.now_ns() + SECOND_NS)
+    bench.camera.trigger()
+    bench.projector.show(0)
+    assert mean_of(bench.popped().pixels) > 3 * dark
+
+
 def test_light_lies_within_the_declared_latency_and_settle() -> None:
     """Exposures that end before the earliest change or begin after the latest see one image only."""
     for seed in range(3):
