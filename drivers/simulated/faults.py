@@ -59,7 +59,7 @@ class ProjectorFaults:
     skip: tuple[int, ...] = ()
     """flips that are reported and change nothing"""
     double: tuple[int, ...] = ()
-    """flips that show the image before again; later ones come late by one, until the host goes back to an earlier image"""
+    """flips that show the image before again; later ones come one late, until the host goes back to an earlier image"""
     unplug_after: int | None = field(default=None, metadata={"low": 0})
     """DeviceLost after so many flips"""
     times: int = field(default=FOREVER, metadata={"low": 0})
