@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import rfft
 
 from scanner.decode.mcp.linking import Chains
 from scanner.decode.mcp.model import PatternModel
@@ -129,42 +130,46 @@ def search_carriers(signals: Signals, chains: Chains, model: PatternModel, aroun
     between = np.concatenate(
         ([ordered[0] - model.separation / 2], (ordered[1:] + ordered[:-1]) / 2, [ordered[-1] + model.separation / 2])
     )
-    best, contrast = around, np.zeros(model.channels)
-    score = -np.inf
-    for scale in scales:
-        if ordered[-1] / scale > 0.45:
-            continue  # beyond what four-pixel columns and a blurred lens show
-        on = np.interp(model.carriers / scale, frequency, spectrum)
-        off = np.interp(between / scale, frequency, spectrum)
-        # Each carrier against its own two neighbours: a slope of the background favours none.
-        rank = np.argsort(np.argsort(model.carriers))
-        ground = np.sqrt(off[rank] * off[rank + 1])
-        ratio = on / np.maximum(ground, 1e-9)
-        value = float(np.log(ratio).clip(-1, 1.5).sum() + 0.5 * np.log(ratio.clip(0.1).min()))
-        if value > score:
-            best, contrast, score = float(scale), ratio, value
-    return CarrierSearch(best, tuple(float(r) for r in contrast))
+    # Beyond .45 cycles a pixel neither columns of four pixels nor a blurred lens show a carrier.
+    scales = scales[ordered[-1] / scales <= 0.45]
+    if not len(scales):
+        return CarrierSearch(around, (0.0,) * model.channels)
+    on = np.interp(model.carriers[None, :] / scales[:, None], frequency, spectrum)
+    off = np.interp(between[None, :] / scales[:, None], frequency, spectrum)
+    # Each carrier against its own two neighbours: a slope of the background favours none.
+    rank = np.argsort(np.argsort(model.carriers))
+    ratio = on / np.maximum(np.sqrt(off[:, rank] * off[:, rank + 1]), 1e-9)
+    logs = np.log(np.maximum(ratio, 0.1))
+    best = int(np.argmax(logs.clip(-1, 1.5).sum(axis=1) + 0.5 * logs.min(axis=1)))
+    return CarrierSearch(float(scales[best]), tuple(float(r) for r in ratio[best]))
 
 
 def _mean_spectrum(light: Array, chains: Chains, size: int) -> NDArray[np.float64] | None:
     """Mean amplitude spectrum of Hann windows of `size` samples along the chains, relative to their brightness."""
     window = np.hanning(size).astype(np.float32)
-    pieces = []
+    starts: list[int] = []
+    lengths: list[int] = []
     for first, last in zip(chains.start[:-1] * STEP, chains.start[1:] * STEP, strict=True):
-        for a in range(first, last - size + 1, size // 2):
-            pieces.append(light[a : a + size])
-        if size // 3 <= last - first < size:
-            pieces.append(np.pad(light[first:last] - light[first:last].mean(), (0, size - (last - first))))
-    if not pieces:
+        if last - first >= size:
+            starts.extend(range(first, last - size + 1, size // 2))
+        elif last - first >= size // 3:
+            starts.append(first)
+        lengths.extend([min(last - first, size)] * (len(starts) - len(lengths)))
+    if not starts:
         return None
-    block = np.stack(pieces)
-    mean = np.abs((block * window).sum(axis=1, keepdims=True) / window.sum())
-    spread = block.std(axis=1, keepdims=True)
-    block = (block - (block * window).sum(axis=1, keepdims=True) / window.sum()) * window
+    thin = max(1, len(starts) // 256)  # enough for a mean
+    begin, length = np.asarray(starts)[::thin], np.asarray(lengths)[::thin]
+    sample = np.arange(size)
+    present = sample[None, :] < length[:, None]
+    block = np.where(present, light[np.minimum(begin[:, None] + sample[None, :], len(light) - 1)], np.float32(0))
+    weight = present * window
+    mean = (block * weight).sum(axis=1, keepdims=True) / np.maximum(weight.sum(axis=1, keepdims=True), 1e-6)
+    block = (block - mean) * weight
     # Dark pieces weigh by their own spread, or a valley's noise outweighs stripes.
-    block /= np.maximum(np.maximum(mean, spread), 1e-6)
-    amplitude = np.abs(np.fft.rfft(block, 2 * size, axis=1))
-    return np.asarray(np.sqrt((amplitude**2).mean(axis=0)))
+    spread = np.sqrt((block**2).sum(axis=1, keepdims=True) / (window**2).sum())
+    block /= np.maximum(np.maximum(np.abs(mean), spread), 1e-6)
+    amplitude = np.abs(rfft(block.astype(np.float32), 2 * size, axis=1))
+    return np.asarray(np.sqrt((amplitude**2).mean(axis=0)), np.float64)
 
 
 def window_px(model: PatternModel, scale: float) -> int:
@@ -201,16 +206,13 @@ def fit_field(
             middles.append(a + size // (2 * STEP))
     if len(starts) < 8:
         return np.ones(len(peaks), np.float32)
-    index = np.asarray(starts)[:, None] * STEP + np.arange(size)[None, :]
-    block = light[index]
-    mean = (block @ window) / window.sum()
-    block = ((block - mean[:, None]) * window).astype(np.float32)
-    power = np.zeros((len(starts), len(trial)))
+    basis = np.empty((len(trial), size, 2 * model.channels), np.float32)
     for j, delta in enumerate(trial):
-        basis = np.exp(-2j * np.pi * t[:, None] * (model.carriers / (scale * (1 + delta)))[None, :])
-        part = block @ np.concatenate([basis.real, basis.imag], axis=1).astype(np.float32)
-        power[:, j] = (part**2).sum(axis=1)
-    power /= np.maximum(mean[:, None], 1e-3) ** 2
+        phase = 2 * np.pi * t[:, None] * (model.carriers / (scale * (1 + delta)))[None, :]
+        basis[j, :, : model.channels], basis[j, :, model.channels :] = np.cos(phase), np.sin(phase)
+    power = np.zeros((len(starts), len(trial)), np.float32)
+    mean = np.zeros(len(starts), np.float32)
+    _powers(light, np.asarray(starts, np.int32) * STEP, window.astype(np.float32), basis, mean, power)
     best = power.argmax(axis=1)
     inside = (best > 0) & (best < len(trial) - 1) & (mean > 0)
     row = np.arange(len(best))
@@ -227,6 +229,33 @@ def fit_field(
     design = np.stack([np.ones(len(x)), x, y, x * y], axis=1)
     field = _robust_fit(design[at], value, weight, design)
     return np.asarray(1 + np.clip(field, -FIELD_RANGE, FIELD_RANGE), np.float32)
+
+
+@kernel
+def _powers(light: Array, starts: Ints, window: Array, basis: Array, mean: Array, power: Array) -> None:
+    """Power on all carriers over squared brightness, for each window and each trial magnification."""
+    trials, size, waves = basis.shape
+    piece = np.empty(size, np.float32)
+    dots = np.empty(waves, np.float32)
+    total = np.float32(0)
+    for q in range(size):
+        total += window[q]
+    for n in range(len(starts)):
+        level = np.float32(0)
+        for q in range(size):
+            level += window[q] * light[starts[n] + q]
+        level /= total
+        mean[n] = level
+        for q in range(size):
+            piece[q] = (light[starts[n] + q] - level) * window[q]
+        for j in range(trials):
+            dots[:] = 0
+            for q in range(size):
+                for w in range(waves):
+                    dots[w] += piece[q] * basis[j, q, w]
+            for w in range(waves):
+                power[n, j] += dots[w] * dots[w]
+            power[n, j] /= max(level * level, np.float32(1e-6))
 
 
 def _robust_fit(design: Any, value: Any, weight: Any, everywhere: Any) -> NDArray[np.float64]:

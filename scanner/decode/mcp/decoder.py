@@ -418,16 +418,11 @@ def _reasons(found: _Found, decided: _Decision, rows: Array) -> NDArray[np.uint8
     why = np.full(len(peaks), np.uint8(Reason.BORDER))
     why[decided.label < 0] = Reason.UNWRAP_RISK
     why[signals.clipped > 0.5] = Reason.CLIPPED
-    small = np.zeros((found.reduced.shape[1], found.reduced.shape[0]), np.uint8)
     # Without a peak: dark is shadow, bright is too little modulation.
     half_lit = np.median(peaks.valley) + 0.5 * np.median(peaks.height)
-    small[:] = np.where(half_lit < found.reduced.T, Reason.LOW_MODULATION, Reason.SHADOW)
-    reach = int(0.6 * found.pitch)
-    y = np.rint(peaks.y).astype(np.intp)
-    for offset in range(-reach, reach + 1):
-        at = np.clip(y + offset, 0, small.shape[0] - 1)
-        small[at, chains.column] = why
-    reason = np.repeat(small, stripes.STEP, axis=1)
+    small = np.where(half_lit < found.reduced, np.uint8(Reason.LOW_MODULATION), np.uint8(Reason.SHADOW))
+    dense.spread(chains.column, peaks.y, why, int(0.6 * found.pitch), small)
+    reason = np.repeat(small.T, stripes.STEP, axis=1)
     if reason.shape[1] < rows.shape[1]:
         reason = np.pad(reason, ((0, 0), (0, rows.shape[1] - reason.shape[1])), mode="edge")
     reason[np.isfinite(rows)] = Reason.VALUE

@@ -254,3 +254,27 @@ def _mark(y: Array, stripe: Ints, order: Ints, start: Ints, column: Ints, result
                 row = int(np.floor(line + np.float32(0.5)))
                 if 0 <= row < height:
                     result[row, 4 * column[k] + j] = stripe[k]
+
+
+def spread(column: Ints, y: Array, value: NDArray[np.uint8], reach: int, around: NDArray[np.uint8]) -> None:
+    """Write each peak's value on the pixels within `reach` px of it of its column, the nearer peak's where two meet.
+
+    Args:
+        column, y, value: (P,) of the peaks, column by column, from top to bottom.
+        reach: px.
+        around: (B, H), changed in place.
+    """
+    _spread(column, y, value, reach, around)
+
+
+@kernel
+def _spread(column: Ints, y: Array, value: NDArray[np.uint8], reach: int, around: NDArray[np.uint8]) -> None:
+    count, size = len(y), around.shape[1]
+    for k in range(count):
+        low, high = y[k] - reach, y[k] + reach
+        if k > 0 and column[k - 1] == column[k]:
+            low = max(low, np.float32(0.5) * (y[k - 1] + y[k]))
+        if k + 1 < count and column[k + 1] == column[k]:
+            high = min(high, np.float32(0.5) * (y[k] + y[k + 1]))
+        for q in range(max(int(np.ceil(low)), 0), min(int(np.floor(high)), size - 1) + 1):
+            around[column[k], q] = value[k]

@@ -9,13 +9,15 @@ fit's residual says how far its amplitudes can be trusted.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.mcp.carriers import FIELD_RANGE, FIELD_STEP
+from scanner.decode.mcp.carriers import FIELD_STEP
 from scanner.decode.mcp.linking import Chains
 from scanner.decode.mcp.model import PatternModel
+from scanner.decode.mcp.stripes import STEP
 from scanner.kernel import kernel
 
 Array = NDArray[np.float32]
@@ -23,6 +25,9 @@ Ints = NDArray[np.int32]
 
 MODULATION_FLOOR = 0.15
 """Share of a carrier's amplitude below which it is taken for lost: a dark frame must not latch on to noise."""
+
+MODULATION_TOP = 1.6
+"""Above 1 where blur lifts the valleys next to dim stripes, so that their brightness is underrated; no more than that."""
 
 SPREAD = 0.22
 """Relative spread of a carrier's amplitude over a scene: focus, gloss and albedo within the window."""
@@ -33,6 +38,9 @@ GROUND = 3
 SHORT_POWER = 1.5
 """A chain shorter than the window leaves the fit few degrees of freedom, and what is not white (texture, shading) hides
 in the carriers instead of the residual: sigma grows by this power of window over length."""
+
+NOTHING_SEEN = np.float32(10)
+"""Sigma of an amplitude that was not measured: wider than anything a carrier can do."""
 
 OUTLIER = 0.01
 """Probability that an amplitude says nothing. It bounds what one channel can say to a factor of a hundred."""
@@ -64,53 +72,57 @@ def measure(light: Array, chains: Chains, field: Array, model: PatternModel, sca
         Amplitudes in the order of the peaks.
     """
     count, channels = len(field), model.channels
-    steps = np.arange(-FIELD_RANGE, FIELD_RANGE + 1e-9, FIELD_STEP)
-    omega = (2 * np.pi * model.carriers / scale).astype(np.float64)
-    lengths = chains.lengths
-    short = np.unique(np.minimum(lengths * 4, size))
+    omega = tuple(float(w) for w in 2 * np.pi * model.carriers.astype(np.float64) / scale)
+    of_chain = np.minimum(chains.lengths * STEP, size)
+    of_peak = np.empty(count, np.int32)
+    of_peak[chains.order] = np.repeat(of_chain, chains.lengths)
+    pick = np.rint((field - 1) / FIELD_STEP).astype(np.int32)
     ratio = np.zeros((count, channels), np.float32)
-    sigma = np.full((count, channels), np.float32(10))
+    sigma = np.full((count, channels), NOTHING_SEEN)
     bright = np.zeros(count, np.float32)
-    pick = np.clip(np.rint((field - 1 + FIELD_RANGE) / FIELD_STEP), 0, len(steps) - 1).astype(np.int32)
-    for length in short:
-        if length < 8:
+    for length in np.unique(of_chain):
+        if length < 2 * STEP:
             continue  # fewer samples than unknowns say nothing
-        chosen = np.flatnonzero(np.minimum(lengths * 4, size) == length).astype(np.int32)
-        basis, inverse, window = _tables(omega, steps, int(length))
+        # A shorter window resolves less: coarser steps do.
+        coarse = max(1, size // int(length))
+        at = of_peak == length
+        steps, index = np.unique(np.rint(pick[at] / coarse).astype(np.int32) * coarse, return_inverse=True)
+        pick[at] = index
+        tables = [_table(omega, int(step), int(length)) for step in steps]
+        chosen = np.flatnonzero(of_chain == length).astype(np.int32)
+        basis, inverse = np.stack([t[0] for t in tables]), np.stack([t[1] for t in tables])
         shortness = np.float32((size / length) ** SHORT_POWER)
-        tables = (basis, inverse, window)
-        _fit(light, chains.order, chains.start, chosen, pick, *tables, shortness, ratio, sigma, bright)
+        hop = max(1, int(length) // (8 * STEP))
+        links = (chains.order, chains.start, chosen, pick)
+        _fit(light, *links, basis, inverse, _window(int(length)), shortness, hop, ratio, sigma, bright)
     return Amplitudes(ratio, sigma, bright)
 
 
-def _tables(omega: NDArray[np.float64], steps: NDArray[np.float64], size: int) -> tuple[Array, Array, Array]:
-    """Weighted bases (K, size, 16 or more) and inverse normal matrices (K, Q, Q) per magnification; window (size,).
+@lru_cache(maxsize=256)
+def _window(size: int) -> Array:
+    """Hann weights with a foot, so that the ends hold the slope."""
+    return (0.02 + 0.98 * np.hanning(size + 2)[1:-1]).astype(np.float32)
+
+
+@lru_cache(maxsize=4096)
+def _table(omega: tuple[float, ...], step: int, size: int) -> tuple[Array, Array]:
+    """Weighted basis (size, Q padded to eights) and inverse normal matrix (Q, Q) for one magnification.
 
     Q = GROUND + 2 N: mean, slope and bend, then cosine and sine of each carrier, about the window's middle. A ridge of
-    1e-3 keeps carriers that a short chain cannot tell apart finite; their sigma is then large.
+    1e-3 keeps carriers that a short chain cannot tell apart finite; their sigma is then large. Frames of a series ask
+    for the same tables again and again: they are kept.
     """
     t = np.arange(size) - (size - 1) / 2
-    window = 0.02 + 0.98 * np.hanning(size + 2)[1:-1]
-    bases, inverses = [], []
-    for step in steps:
-        phase = t[:, None] * (omega / (1 + step))[None, :]
-        design = np.concatenate(
-            [
-                np.vander(2 * t / size, GROUND, increasing=True),
-                np.stack([np.cos(phase), np.sin(phase)], 2).reshape(size, -1),
-            ],
-            axis=1,
-        )
-        normal = design.T @ (window[:, None] * design)
-        ridge = np.full(design.shape[1], 1e-3 * window.sum())
-        ridge[0] = 0
-        bases.append(np.pad(window[:, None] * design, ((0, 0), (0, -design.shape[1] % 8))))
-        inverses.append(np.linalg.inv(normal + np.diag(ridge)))
-    return (
-        np.ascontiguousarray(bases, np.float32),
-        np.ascontiguousarray(inverses, np.float32),
-        window.astype(np.float32),
-    )
+    window = _window(size).astype(np.float64)
+    phase = t[:, None] * (np.asarray(omega) / (1 + step * FIELD_STEP))[None, :]
+    ground = np.vander(2 * t / size, GROUND, increasing=True)
+    design = np.concatenate([ground, np.stack([np.cos(phase), np.sin(phase)], 2).reshape(size, -1)], axis=1)
+    weighted = window[:, None] * design
+    ridge = np.full(design.shape[1], 1e-3 * window.sum())
+    ridge[0] = 0
+    inverse = np.linalg.inv(design.T @ weighted + np.diag(ridge))
+    padded = np.pad(weighted, ((0, 0), (0, -design.shape[1] % 8)))
+    return padded.astype(np.float32), inverse.astype(np.float32)
 
 
 @kernel
@@ -124,6 +136,7 @@ def _fit(
     inverse: Array,
     window: Array,
     shortness: np.float32,
+    hop: int,
     ratio: Array,
     sigma: Array,
     bright: Array,
@@ -144,7 +157,7 @@ def _fit(
         for p in range(first, last):
             k = order[p]
             begin = min(max(p - half, first), last - size // 4)
-            if begin == previous:  # the window stands still at a chain's ends
+            if begin == previous or (p - first) % hop:  # the window stands still at a chain's ends
                 j = order[p - 1]
                 for i in range(channels):
                     ratio[k, i] = ratio[j, i]
@@ -199,7 +212,7 @@ def first_modulation(seen: Amplitudes, model: PatternModel) -> Array:
         quantile = 1 - share / 2
         expected = float(np.quantile(own, quantile, method="nearest"))
         result[i] = np.quantile(seen.ratio[good, i], quantile) / max(expected, 1e-6)
-    return np.clip(result, MODULATION_FLOOR, 1.3)
+    return np.clip(result, MODULATION_FLOOR, MODULATION_TOP)
 
 
 CLEAR = 5.0
@@ -276,16 +289,33 @@ def refined_modulation(seen: Amplitudes, model: PatternModel, posterior: Array, 
     """
     modulation = previous.copy()
     floor = np.full(model.channels, 0.02, np.float32)
+    strength = np.zeros((len(posterior), 2, model.channels), np.float32)
+    _expected(posterior, np.ascontiguousarray(np.stack([model.ratio, model.ratio > 0], axis=1), np.float32), strength)
+    expected, on = strength[:, 0], strength[:, 1]
     for i in range(model.channels):
-        expected = posterior @ model.ratio[:, i]
-        square = posterior @ model.ratio[:, i] ** 2
-        if square.sum() > 1e-3 * len(posterior):
-            modulation[i] = np.clip((expected * seen.ratio[:, i]).sum() / square.sum(), MODULATION_FLOOR, 1.3)
-        off = seen.ratio[posterior @ (model.ratio[:, i] == 0).astype(np.float32) > 0.9, i]
+        # Where carried for certain, the expected ratio is the pattern's own: least squares through the origin.
+        square = float((expected[:, i] ** 2).sum())
+        if square > 1e-3 * len(posterior) * float(model.ratio[:, i].max()) ** 2:
+            product = float((expected[:, i] * seen.ratio[:, i]).sum())
+            modulation[i] = np.clip(product / square, MODULATION_FLOOR, MODULATION_TOP)
+        off = seen.ratio[on[:, i] < 0.1, i]
         if len(off) > 10:
             # Rayleigh: the median is 1.177 sigma. What texture adds here and there is in each fit's own residual.
             floor[i] = np.clip(np.median(off) / 1.177, 0.008, 0.1)
     return modulation, floor
+
+
+@kernel
+def _expected(posterior: Array, table: Array, result: Array) -> None:
+    """result[k] = sum over states of posterior[k, s] table[s]; most states have no share worth the sum."""
+    count, states = posterior.shape
+    for k in range(count):
+        for s in range(states):
+            share = posterior[k, s]
+            if share > np.float32(1e-4):
+                for m in range(table.shape[1]):
+                    for i in range(table.shape[2]):
+                        result[k, m, i] += share * table[s, m, i]
 
 
 def log_likelihood(seen: Amplitudes, model: PatternModel, modulation: Array, floor: Array) -> tuple[Array, Array]:

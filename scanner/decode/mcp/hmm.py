@@ -117,16 +117,13 @@ NEGLIGIBLE = np.float32(1e-6)
 
 
 @kernel
-def _move(source: Array, table: Array, target: Array) -> None:
-    """target = source @ table, without the sources that hardly matter."""
+def _move(source: Array, table: Array, least: np.float32, target: Array) -> None:
+    """target = source @ table, without the sources below `least`, which hardly matter."""
     states = len(source)
     target[:] = 0
-    top = np.float32(0)
-    for p in range(states):
-        top = max(top, source[p])
     for p in range(states):
         a = source[p]
-        if a > NEGLIGIBLE * top:
+        if a > least:
             row = table[p]
             for s in range(states):
                 target[s] += a * row[s]
@@ -149,7 +146,9 @@ def _likelihoods(evidence: Array, stray_log: np.float32, likely: Array) -> np.fl
     for s in range(len(evidence)):
         top = max(top, evidence[s])
     for s in range(len(evidence)):
-        likely[s] = np.float32(1 - STRAY) * np.exp(evidence[s] - top)
+        below = evidence[s] - top
+        # Far below JUMP at every turn, and exponentials are dear.
+        likely[s] = np.float32(1 - STRAY) * np.exp(below) if below > np.float32(-25) else np.float32(0)
     lost: np.float32 = np.float32(STRAY) * np.exp(stray_log - top)
     return lost
 
@@ -190,16 +189,17 @@ def _forward_backward(
             if t == 0:
                 moved[0, :] = alpha[0]
             else:
-                _move(alpha[t], tables[gap[first + t]], moved[t])
+                _move(alpha[t], tables[gap[first + t]], NEGLIGIBLE, moved[t])
             for s in range(states):
                 # The state of a stray peak is that of the peak before it.
                 alpha[t + 1, s] = moved[t, s] * likely[t, s] + alpha[t, s] * lost[t]
             _normalise(alpha[t + 1])
         beta[:] = 1
         for t in range(size - 1, -1, -1):
-            bad, good = np.float32(0), np.float32(0)
+            bad, good, top = np.float32(0), np.float32(0), np.float32(0)
             for s in range(states):
                 product[s] = likely[t, s] * beta[s]
+                top = max(top, product[s])
                 posterior[first + t, s] = moved[t, s] * product[s]
                 good += posterior[first + t, s]
                 bad += alpha[t, s] * lost[t] * beta[s]
@@ -208,7 +208,7 @@ def _forward_backward(
                 posterior[first + t, s] *= scale
             stray[first + t] = bad * scale
             if t > 0:
-                _move(product, turned[gap[first + t]], before)
+                _move(product, turned[gap[first + t]], NEGLIGIBLE * top, before)
                 for s in range(states):
                     beta[s] = before[s] + beta[s] * lost[t]
                 _normalise(beta)

@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len, rfft
 
 from scanner.decode.mcp.model import PatternModel
 from scanner.kernel import kernel
@@ -115,26 +116,22 @@ def estimate_pitch(reduced: Array, model: PatternModel) -> tuple[float, float]:
         pitch in image px, and the correlation (0..1) of image and pattern spectrum at it.
     """
     axis = np.arange(np.log(2.0 / reduced.shape[1]), np.log(0.5), _LOG_STEP)
-    seen = _log_spectrum(reduced[:: max(1, len(reduced) // 96)], axis)
+    seen = _log_spectrum(reduced[:: max(1, len(reduced) // 64)], axis)
     # The pattern's own, sampled at 16 to a pitch: 1 / 16 is the stripes' frequency there.
     centre = np.log(1 / 16)
     own_axis = centre + np.arange(-100, 131) * _LOG_STEP
     own = _log_spectrum(model.column[None, :], own_axis)
     low = int(np.searchsorted(axis, np.log(MIN_STRIPES / reduced.shape[1])))
     high = int(np.searchsorted(axis, np.log(1 / (MIN_PITCH_PX * 0.8))))
-    total = max(float(seen @ seen), 1e-12)
-    best, score = low, -1.0
-    for i in range(low, high):
-        first, last = i - 100, i + 131
-        a, b = max(first, 0), min(last, len(axis))
-        piece, mask = seen[a:b], own[a - first : len(own) - (last - b)]
-        norm = np.sqrt((piece @ piece) * (own @ own))
-        value = float(piece @ mask / norm) if norm > 0 else 0.0
-        # Sums over fewer bins near the ends are no worse evidence; energy decides between equals.
-        value *= float(np.sqrt((piece @ piece) / total)) ** 0.5
-        if value > score:
-            best, score = i, value
-    return float(1 / np.exp(axis[best])), score
+    # Correlation at every shift at once; where the pattern's spectrum sticks out, over what is left.
+    padded = np.pad(seen, (100, 130))
+    product = np.correlate(padded, own)
+    energy = np.correlate(padded**2, np.ones(len(own)))
+    norm = np.sqrt(energy * (own @ own)) + 1e-12
+    # The share of the image's energy in the window decides between equals.
+    score = product / norm * (energy / max(float(seen @ seen), 1e-12)) ** 0.25
+    best = low + int(np.argmax(score[low:high]))
+    return float(1 / np.exp(axis[best])), float(score[best])
 
 
 def _log_spectrum(columns: Array, axis: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -142,8 +139,8 @@ def _log_spectrum(columns: Array, axis: NDArray[np.float64]) -> NDArray[np.float
     size = columns.shape[1]
     window = np.hanning(size).astype(np.float32)
     mean = (columns * window).sum(axis=1, keepdims=True) / window.sum()
-    length = int(2 ** np.ceil(np.log2(2 * size)))
-    amplitude = np.abs(np.fft.rfft((columns - mean) * window, length, axis=1)).mean(axis=0)
+    length = next_fast_len(2 * size, real=True)
+    amplitude = np.abs(rfft((columns - mean) * window, length, axis=1)).mean(axis=0)
     frequency = np.arange(len(amplitude)) / length
     # Times frequency: scenes fall off with 1 / f, so this makes their part level.
     on_axis = np.interp(np.exp(axis), frequency, amplitude * frequency)

@@ -257,25 +257,39 @@ def _bends(y: Array, start: Ints, label: Ints, pitch: np.float32) -> Array:
 
     With rows t in pitches, y = y0 + a t + c t^2 about a peak; the figure is c / a^2, so that a flank u px away lies
     (c / a^2) u^2 further than on a surface of even pitch. A stripe with one neighbour takes the neighbour's figure.
+    A step of depth bends one stripe one way and the next the other: what no neighbour shows alike is no bend.
     """
-    bend = np.zeros(len(y), np.float32)
+    raw, bend = np.zeros(len(y), np.float32), np.zeros(len(y), np.float32)
     known = np.zeros(len(y), np.bool_)
+    slight = np.float32(0.03) / pitch
     for b in range(len(start) - 1):
         for k in range(start[b] + 1, start[b + 1] - 1):
             s = label[k]
             if s < 1 or label[k - 1] != s - 1 or label[k + 1] != s + 1:
                 continue
             before, after = y[k] - y[k - 1], y[k + 1] - y[k]
-            # A step of depth is no bend: its second difference is not small beside the pitch.
             if abs(after - before) < np.float32(MOST_BEND) * pitch:
                 half = np.float32(0.5) * (before + after)
-                bend[k] = np.float32(0.5) * (after - before) / (half * half)
+                raw[k] = np.float32(0.5) * (after - before) / (half * half)
                 known[k] = True
         for k in range(start[b], start[b + 1]):
-            if known[k] or label[k] < 0:
+            above = k - 1 if k > start[b] and known[k - 1] and label[k - 1] == label[k] - 1 else -1
+            below = k + 1 if k + 1 < start[b + 1] and known[k + 1] and label[k + 1] == label[k] + 1 else -1
+            if known[k]:
+                alike = (above >= 0 and _alike(raw[above], raw[k])) or (below >= 0 and _alike(raw[below], raw[k]))
+                bend[k] = raw[k] if alike or abs(raw[k]) < slight else np.float32(0)
+        for k in range(start[b], start[b + 1]):
+            if label[k] < 0 or known[k]:
                 continue
             if k + 1 < start[b + 1] and known[k + 1] and label[k + 1] == label[k] + 1:
                 bend[k] = bend[k + 1]
             elif k > start[b] and known[k - 1] and label[k - 1] == label[k] - 1:
                 bend[k] = bend[k - 1]
     return bend
+
+
+@kernel
+def _alike(one: np.float32, other: np.float32) -> bool:
+    """Of one sign, and within a factor of three."""
+    a, b = abs(one), abs(other)
+    return bool(one * other > 0 and 3 * min(a, b) > max(a, b))
