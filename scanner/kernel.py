@@ -22,3 +22,12 @@ def kernel(function: _F) -> _F:
 def parallel_kernel(function: _F) -> _F:
     """Compile `function` for all threads (`numba.prange`), cached, without the interpreter lock."""
     return cast(_F, numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")(function))
+
+
+def summing_kernel(function: _F) -> _F:
+    """Compile `function` like `kernel`, free to take sums in any order: a dot product then runs in vector registers.
+
+    Results may differ in the last bits from one machine to another. NaN and infinity keep their meaning.
+    """
+    options = {"reassoc", "contract", "nsz"}
+    return cast(_F, numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=options)(function))

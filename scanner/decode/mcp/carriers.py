@@ -18,7 +18,7 @@ from scipy.fft import rfft
 from scanner.decode.mcp.linking import Chains
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.stripes import STEP, Image, Peaks
-from scanner.kernel import kernel
+from scanner.kernel import kernel, summing_kernel
 
 Array = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -206,10 +206,10 @@ def fit_field(
             middles.append(a + size // (2 * STEP))
     if len(starts) < 8:
         return np.ones(len(peaks), np.float32)
-    basis = np.empty((len(trial), size, 2 * model.channels), np.float32)
+    basis = np.empty((len(trial), 2 * model.channels, size), np.float32)
     for j, delta in enumerate(trial):
-        phase = 2 * np.pi * t[:, None] * (model.carriers / (scale * (1 + delta)))[None, :]
-        basis[j, :, : model.channels], basis[j, :, model.channels :] = np.cos(phase), np.sin(phase)
+        phase = 2 * np.pi * t[None, :] * (model.carriers / (scale * (1 + delta)))[:, None]
+        basis[j, : model.channels], basis[j, model.channels :] = np.cos(phase), np.sin(phase)
     power = np.zeros((len(starts), len(trial)), np.float32)
     mean = np.zeros(len(starts), np.float32)
     _powers(light, np.asarray(starts, np.int32) * STEP, window.astype(np.float32), basis, mean, power)
@@ -231,12 +231,11 @@ def fit_field(
     return np.asarray(1 + np.clip(field, -FIELD_RANGE, FIELD_RANGE), np.float32)
 
 
-@kernel
+@summing_kernel
 def _powers(light: Array, starts: Ints, window: Array, basis: Array, mean: Array, power: Array) -> None:
     """Power on all carriers over squared brightness, for each window and each trial magnification."""
-    trials, size, waves = basis.shape
+    trials, waves, size = basis.shape
     piece = np.empty(size, np.float32)
-    dots = np.empty(waves, np.float32)
     total = np.float32(0)
     for q in range(size):
         total += window[q]
@@ -249,12 +248,12 @@ def _powers(light: Array, starts: Ints, window: Array, basis: Array, mean: Array
         for q in range(size):
             piece[q] = (light[starts[n] + q] - level) * window[q]
         for j in range(trials):
-            dots[:] = 0
-            for q in range(size):
-                for w in range(waves):
-                    dots[w] += piece[q] * basis[j, q, w]
             for w in range(waves):
-                power[n, j] += dots[w] * dots[w]
+                wave = basis[j, w]
+                dot = np.float32(0)
+                for q in range(size):
+                    dot += piece[q] * wave[q]
+                power[n, j] += dot * dot
             power[n, j] /= max(level * level, np.float32(1e-6))
 
 

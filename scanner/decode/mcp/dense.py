@@ -74,7 +74,9 @@ def interpolate(knots: Knots, shape: tuple[int, int], pitch: float, step: float)
         narrow,
     )
     wide = np.empty((5, *shape), np.float32)
-    _widen(narrow, np.float32(step / 3), wide)
+    turned = np.empty((5, shape[0], columns), np.float32)
+    _turn(narrow, turned)
+    _widen(turned, np.float32(step / 3), wide)
     return Maps(*wide)
 
 
@@ -187,37 +189,48 @@ def _copy(b: int, q: int, others: Array, k: int, narrow: Array) -> None:
 
 
 @kernel
-def _widen(narrow: Array, agree: np.float32, wide: Array) -> None:
-    """Columns four pixels apart (x = 4 b + 1.5) to all pixels, turned upright."""
-    columns, size = narrow.shape[1], narrow.shape[2]
-    width = wide.shape[2]
-    nan = np.float32(np.nan)
+def _turn(narrow: Array, turned: Array) -> None:
+    """(5, B, H) to (5, H, B), in blocks that stay in the cache."""
+    maps, columns, size = narrow.shape
     block = 16
-    for y0 in range(0, size, block):
-        y1 = min(y0 + block, size)
+    for m in range(maps):
+        for b0 in range(0, columns, block):
+            for y0 in range(0, size, block):
+                for y in range(y0, min(y0 + block, size)):
+                    for b in range(b0, min(b0 + block, columns)):
+                        turned[m, y, b] = narrow[m, b, y]
+
+
+@kernel
+def _widen(narrow: Array, agree: np.float32, wide: Array) -> None:
+    """Columns four pixels apart (x = 4 b + 1.5) to all pixels: (5, H, B) to (5, H, W).
+
+    x = 4 b + 2 .. 4 b + 5 lie 1, 3, 5 and 7 eighths of the way from column b to the next.
+    """
+    maps, size, columns = narrow.shape
+    width = wide.shape[2]
+    for y in range(size):
+        for m in range(maps):
+            wide[m, y, :2] = narrow[m, y, 0]
+            wide[m, y, 4 * columns - 2 :] = narrow[m, y, columns - 1]
+        for b in range(columns - 1):
+            # False where either is NaN: then the nearer column counts alone.
+            blend = abs(narrow[0, y, b + 1] - narrow[0, y, b]) < agree
+            for m in range(maps):
+                _four(narrow[m, y, b], narrow[m, y, b + 1], blend, wide[m, y, 4 * b + 2 : 4 * b + 6])
         for x in range(width):
-            position = np.float32(x - 1.5) * np.float32(0.25)
-            b = int(np.floor(position))
-            t = position - np.float32(b)
-            a, c = max(b, 0), min(max(b + 1, 0), columns - 1)
-            a = min(a, columns - 1)
-            for y in range(y0, y1):
-                left, right = narrow[0, a, y], narrow[0, c, y]
-                if abs(right - left) < agree:  # false where either is NaN
-                    wide[0, y, x] = left + (right - left) * t
-                    for m in range(1, 5):
-                        wide[m, y, x] = narrow[m, a, y] + (narrow[m, c, y] - narrow[m, a, y]) * t
-                    continue
-                pick = a if t < np.float32(0.5) else c
-                if np.isnan(narrow[0, pick, y]):
-                    wide[0, y, x] = nan
-                    wide[1, y, x] = nan
-                    wide[2, y, x] = 0
-                    wide[3, y, x] = nan
-                    wide[4, y, x] = nan
-                else:
-                    for m in range(5):
-                        wide[m, y, x] = narrow[m, pick, y]
+            if np.isnan(wide[2, y, x]):
+                wide[2, y, x] = 0
+
+
+@kernel
+def _four(left: np.float32, right: np.float32, blend: bool, pixels: Array) -> None:
+    step = (right - left) * np.float32(0.125)
+    for j in range(4):
+        if blend:
+            pixels[j] = left + step * np.float32(2 * j + 1)
+        else:
+            pixels[j] = left if j < 2 else right
 
 
 def stripe_map(y: Array, stripe: Ints, chains: Chains, shape: tuple[int, int]) -> NDArray[np.int16]:

@@ -18,7 +18,7 @@ from scanner.decode.mcp.carriers import FIELD_STEP
 from scanner.decode.mcp.linking import Chains
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.stripes import STEP
-from scanner.kernel import kernel
+from scanner.kernel import kernel, summing_kernel
 
 Array = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -27,7 +27,7 @@ MODULATION_FLOOR = 0.15
 """Share of a carrier's amplitude below which it is taken for lost: a dark frame must not latch on to noise."""
 
 MODULATION_TOP = 1.6
-"""Above 1 where blur lifts the valleys next to dim stripes, so that their brightness is underrated; no more than that."""
+"""Above 1 where blur lifts the valleys beside dim stripes, so that their brightness is underrated; not more."""
 
 SPREAD = 0.22
 """Relative spread of a carrier's amplitude over a scene: focus, gloss and albedo within the window."""
@@ -125,7 +125,7 @@ def _table(omega: tuple[float, ...], step: int, size: int) -> tuple[Array, Array
     return padded.astype(np.float32), inverse.astype(np.float32)
 
 
-@kernel
+@summing_kernel
 def _fit(
     light: Array,
     order: Ints,
@@ -261,11 +261,13 @@ def agreement(
         columns: where columns begin (B + 1,), and the table to each peak (P,) of `hmm.gaps`; 0 is one pitch.
     """
     words, of_word = np.unique(model.ratio > 0, axis=0, return_inverse=True)
-    each = np.stack([evidence[:, of_word == w].max(axis=1) for w in range(len(words))], axis=1)
-    ranked = np.sort(each, axis=1)
+    of_word = of_word.ravel()
+    thin = slice(0, None, max(1, len(path) // 2000))  # enough for a share
+    each = np.stack([evidence[thin, of_word == w].max(axis=1) for w in range(len(words))], axis=1)
+    ranked = np.partition(each, -2, axis=1)
     best = each.argmax(axis=1)
     clear = (ranked[:, -1] - ranked[:, -2] > CLEAR) & words[best].any(axis=1)
-    agrees = (path >= 0) & (of_word.ravel()[np.maximum(path, 0)] == best)
+    agrees = (path[thin] >= 0) & (of_word[np.maximum(path[thin], 0)] == best)
     start, gap = columns
     first = np.zeros(len(path), bool)
     first[start[:-1][start[:-1] < len(path)]] = True

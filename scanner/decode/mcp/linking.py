@@ -137,6 +137,22 @@ def _silhouettes(
                 beyond[k] = True
 
 
+def floored_log(posterior: Array, floor: float) -> Array:
+    """Natural logarithms of probabilities, none below that of `floor`: (P, S) float32."""
+    logs = np.full(posterior.shape, np.log(floor), np.float32)
+    _floored_log(posterior, np.float32(floor), logs)
+    return logs
+
+
+@kernel
+def _floored_log(posterior: Array, floor: np.float32, logs: Array) -> None:
+    # Few stripes have a share worth a logarithm.
+    for k in range(posterior.shape[0]):
+        for s in range(posterior.shape[1]):
+            if posterior[k, s] > floor:
+                logs[k, s] = np.log(posterior[k, s])
+
+
 def votes_along(log_posterior: Array, chains: Chains, reach: float, gain: float) -> Array:
     """What a peak's neighbours on its chain think it is.
 

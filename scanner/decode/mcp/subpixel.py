@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from scanner.decode.mcp.linking import Chains
 from scanner.decode.mcp.stripes import Peaks
-from scanner.kernel import kernel
+from scanner.kernel import kernel, summing_kernel
 
 Array = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -129,7 +129,7 @@ def _room(size: int, g: np.float32, above: np.float32, below: np.float32, reach:
     return int(min(np.float32(reach), g - 1, size - 3 - g, near))
 
 
-@kernel
+@summing_kernel
 def _products(mean: Array, reach: int, limit: int, bend: np.float32, sums: Array) -> None:
     """Sums over the window of shift x shift, shift x slope, slope x slope, odd x shift, odd x slope, odd x odd.
 
@@ -170,7 +170,7 @@ def _slope_at(p: int, count: int, kappa: Array, worth: Array) -> np.float32:
     return slope * (slope * slope / (slope * slope + np.float32(0.25) * scatter / independent + np.float32(1e-12)))
 
 
-@kernel
+@summing_kernel
 def _window_sums(
     profile: Array, ground: Array, usable: Ints, p: int, count: int, bend: np.float32, mean: Array, sums: Array
 ) -> int:
