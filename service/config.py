@@ -19,10 +19,10 @@ from pydantic_core import ErrorDetails
 
 from drivers.registry import Kind, check_driver
 from scanner.errors import ConfigError
+from scanner.wire import DEFAULT_ENDPOINT
 from service.toml_lines import KeyPath, key_lines
 from service.toml_text import to_toml
 
-DEFAULT_ENDPOINT = "ipc:///run/fringed/control.ipc"
 DEFAULT_SIMULATED = "casey2011/bust"
 
 MAX_FILE_BYTES = 1 << 20

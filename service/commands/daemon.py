@@ -8,10 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
+from scanner.wire import DEFAULT_ENDPOINT
 from service.commands.options import AsJson
 from service.terminal import print_facts, print_json, print_table
-
-DEFAULT_ENDPOINT = "ipc:///run/fringed/control.ipc"
 
 
 def daemon(

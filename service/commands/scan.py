@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import datetime
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -99,13 +100,20 @@ def scan(
         "compare_truth": compare_truth,
         "repeat": repeat,
     }
-    folder = output or Path(datetime.now().astimezone().strftime("scan-%Y%m%d-%H%M%S"))
+    folder = output or _fresh_folder()
     began = time.monotonic()
     with _output(folder, force=force), progress_lines() as lines, _daemon(rig, connect, lines) as endpoint:
         _scan(endpoint, method, params, folder, lines)
         lines.stage("ending")
     report_result(folder, time.monotonic() - began, lines.spent, as_json=as_json)
     return 0
+
+
+def _fresh_folder() -> Path:
+    """scan-DATE-TIME in the working directory, with a number behind it where that exists."""
+    name = datetime.now().astimezone().strftime("scan-%Y%m%d-%H%M%S")
+    numbered = (f"{name}-{n}" for n in count(2))
+    return next(folder for folder in map(Path, chain([name], numbered)) if not folder.exists())
 
 
 def _exposure(text: str) -> float | Literal["auto"]:
@@ -156,31 +164,35 @@ def _daemon(rig: str | None, connect: str | None, lines: ProgressLines) -> Itera
 def _scan(endpoint: str, method: Method, params: Mapping[str, Any], folder: Path, lines: ProgressLines) -> None:
     """Start the job, follow it, fetch its files into place."""
     from scanner.client import Client  # noqa: PLC0415
+    from scanner.errors import StorageError  # noqa: PLC0415
     from scanner.session import raise_unless_done  # noqa: PLC0415
 
     with Client(endpoint, name="fringed scan") as client:
         job_id = client.start_scan(method.value, **params)
         try:
-            raise_unless_done(client.wait(job_id, _follower(lines)))
+            raise_unless_done(client.wait(job_id, _follower(folder, lines)))
             lines.stage("fetching files")
             incoming = folder / INCOMING
             client.fetch(job_id, incoming, lambda _, done, total: lines.advance(done, total))
-        except (KeyboardInterrupt, SystemExit):
+        except (KeyboardInterrupt, SystemExit, StorageError):
             _cancel(client, job_id)
             raise
     _into_place(incoming, folder)
 
 
-def _follower(lines: ProgressLines) -> Callable[[Event], None]:
-    """Draws a job's events."""
+def _follower(folder: Path, lines: ProgressLines) -> Callable[[Event], None]:
+    """Draws a job's events, and asks for room on the disk as soon as the plan says how much is needed."""
+    from scanner.storage import check_room  # noqa: PLC0415
 
     def follow(event: Event) -> None:
         fields = event.fields
         match event.kind:
             case "queued":
                 lines.stage("waiting for the rig")
-            case "started" | "plan":
+            case "started":
                 lines.stage("preparing")
+            case "plan":
+                check_room(folder, int(fields["bytes"]))
             case "frame":
                 done, total = int(fields.get("captured", 0)), int(fields.get("total", 0))
                 lines.stage("capturing", total)

@@ -13,7 +13,9 @@ from typing import Any
 import pytest
 
 from scanner.capture import Capture
+from scanner.errors import StorageError
 from scanner.scan import load_scan
+from service.cli import main
 
 FRINGED = (sys.executable, "-c", "import sys; from service.cli import main; sys.exit(main())")
 SCAN_FILES = {"scan.npz", "cloud.ply", "preview.png", "report.json", "capture"}
@@ -39,7 +41,7 @@ def running(*words: Any) -> Iterator[subprocess.Popen[str]]:
 
 def test_a_scan_from_nothing_to_files_and_again(tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    words = ("scan", "--rig", "simulated:quick/board", "--shifts", "4", "-o", folder)
+    words = ("scan", "--rig", "simulated:quick/board", "-o", folder)
     ran = fringed(*words, "--compare-truth", "--json")
     assert ran.returncode == 0, ran.stderr
     result = json.loads(ran.stdout)
@@ -91,6 +93,19 @@ def test_a_rig_that_is_not_there_is_named(rig: str, said: str, tmp_path: Path) -
     assert ran.returncode == 1
     assert said in ran.stderr
     assert said in json.loads(ran.stdout)["error"]["message"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_without_room_is_noticed_before_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def full(folder: Path, needed: int) -> None:
+        asked.append(needed)
+        raise StorageError(f"{folder} is full", hint="free some space")
+
+    monkeypatch.setattr("scanner.storage.check_room", full)
+    assert main(["scan", "--rig", "simulated:quick/board", "-o", str(tmp_path / "out")]) == 1
+    assert asked[0] > 31 * 320 * 240
     assert list(tmp_path.iterdir()) == []
 
 

@@ -300,10 +300,14 @@ def test_patterns_seen_pixel_by_pixel_decode_to_their_rows(run: Run, capture: Pa
 def test_audit_of_a_capture_without_stamps_proves_nothing(run: Run, capture: Path, tmp_path: Path) -> None:
     status, out, _ = run("audit", capture, "--json")
     assert (status, json.loads(out)["passed"]) == (0, True)
-    assert json.loads(out)["verdicts"] == {"unproved": 12}
+    assert json.loads(out)["verdicts"] == {"proved": 0, "consistent": 0, "unproved": 12}
     status, out, _ = run("audit", capture, "-o", "timing.svg")
-    assert status in (0, 1)
-    assert (tmp_path / "timing.svg").exists() == (status == 0)
+    assert status == 0
+    assert "cannot reveal" in out
+    assert (tmp_path / "timing.svg").read_text().startswith("<svg")
+    status, _, err = run("audit", capture, "-o", "timing.svg")
+    assert status == 2
+    assert "--force" in err
 
 
 def damage_image(folder: Path) -> None:
