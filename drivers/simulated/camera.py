@@ -222,8 +222,8 @@ class SimulatedCamera:
         return self._world.view.truth
 
     def true_calibration(self) -> Calibration:
-        """The rig's geometry, exact."""
-        return self._world.rig.calibration
+        """The rig's geometry, exact, and the projector's response as far as the optics let one know it."""
+        return self._world.calibration
 
     # --- exposures -----------------------------------------------------------------------------------------------
 

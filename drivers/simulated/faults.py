@@ -82,17 +82,13 @@ class Allowance:
 def displayed_index(faults: ProjectorFaults, index: int, count: int) -> int:
     """The image that a flip to `index` of `count` loaded ones really shows.
 
-    Raises:
-        ConfigError: the permutation names an image that is not loaded.
+    A fault that names images beyond those loaded leaves the flip alone: test shots load fewer than a scan.
     """
     if faults.order:
-        return _ordered(faults.order, index, count)
-    if index < len(faults.permute):
-        shown = faults.permute[index]
-        if not 0 <= shown < count:
-            raise ConfigError(f"fault permute shows image {shown}, {count} are loaded")
-        return shown
-    return index
+        shown = _ordered(faults.order, index, count)
+    else:
+        shown = faults.permute[index] if index < len(faults.permute) else index
+    return shown if 0 <= shown < count else index
 
 
 def check_order(order: str) -> None:

@@ -41,6 +41,8 @@ class Optics:
     projector_blur_sigma_px: float = field(default=0.7, metadata={"low": 0.3, "high": 50.0})
     camera_blur_sigma_px: float = field(default=0.7, metadata={"low": 0.0, "high": 20.0})
     gamma: float = field(default=2.3, metadata={"low": 0.1, "high": 10.0})
+    precorrection: float = field(default=2.3, metadata={"low": 0.1, "high": 10.0})
+    """the gamma that the rig's calibration believes in"""
     ambient: float = field(default=0.04, metadata={"low": 0.0, "high": 10.0})
     """share of the projector's full light at the aim point, from everywhere"""
     exposure_scale: float = field(default=1.0, metadata={"low": 0.0, "high": 100.0})

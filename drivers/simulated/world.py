@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import weakref
 from collections import deque
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import Any
 from weakref import WeakValueDictionary
@@ -26,6 +27,7 @@ from drivers.simulated.timeline import LoadedImage, Segment, Timeline
 from drivers.simulated.view import View, view_scene, white_level
 from scanner.clock import Clock
 from scanner.errors import DeviceBusy
+from scanner.geometry import Calibration
 
 NOMINAL_EXPOSURE_NS = 33_333_333
 """Two refreshes at 60 Hz: at this exposure and 0 dB the full-on board's 99th percentile is WHITE of the range."""
@@ -70,6 +72,12 @@ class World:
         self._holders: dict[str, weakref.ref[Any]] = {}
         values = np.arange(256) / 255.0
         self._response: Plane = (values**settings.optics.gamma).astype(np.float32)
+
+    @property
+    def calibration(self) -> Calibration:
+        """The rig's exact geometry, and the response it is believed to have: what `precorrection` undoes."""
+        response = {"projector": {"gamma": self.settings.optics.precorrection}}
+        return replace(self.rig.calibration, extra={"response": response})
 
     def random(self, use: int) -> np.random.Generator:
         """A generator of its own for each use, the same for the same seed."""

@@ -7,7 +7,7 @@ import pytest
 
 from drivers.simulated.faults import ProjectorFaults, displayed_index
 from scanner.devices import CameraFrame, TriggerMode
-from scanner.errors import ConfigError, DeviceLost
+from scanner.errors import DeviceLost
 from tests.unit.simulated_bench import SECOND_NS, Bench
 
 GREYS = (30, 70, 110, 150, 190, 230)
@@ -72,9 +72,10 @@ def test_a_doubled_flip_is_over_when_the_host_begins_again() -> None:
     assert shown(bench, range(6)) == [0, 1, 2, 3, 4, 5]
 
 
-def test_a_permutation_that_shows_what_is_not_loaded_is_refused() -> None:
-    with pytest.raises(ConfigError, match="shows image 9"):
-        displayed_index(ProjectorFaults(permute=(9,)), 0, 3)
+def test_a_permutation_beyond_the_loaded_images_leaves_the_flip_alone() -> None:
+    assert displayed_index(ProjectorFaults(permute=(9, 0)), 0, 2) == 0
+    assert displayed_index(ProjectorFaults(permute=(9, 0)), 1, 2) == 0
+    assert displayed_index(ProjectorFaults(order="swap:1,5"), 1, 2) == 1
 
 
 def test_extra_latency_is_not_declared() -> None:
