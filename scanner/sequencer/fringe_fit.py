@@ -73,3 +73,8 @@ def bright_pixels(scene: Scene, fit: Fit, clipped: NDArray[np.bool_]) -> NDArray
     b = fit.modulation
     sigma = scene.noise * float(np.sqrt(2 / len(fit.positions)))
     return scene.lit & ~clipped & (b > NOISE_SIGMAS * sigma) & (b > 0.25 * float(np.quantile(b, 0.99)))
+
+
+def mean_vector(fit: Fit, use: NDArray[np.bool_]) -> float:
+    """Length of the mean phase vector: 1 where the scene shows one phase only, 0 where it shows all alike."""
+    return float(np.abs(np.exp(2j * np.pi * fit.cycles[use]).mean()))

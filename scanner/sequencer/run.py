@@ -261,13 +261,13 @@ class _Run:
         self.slots(range(self.plan.frame_count))
         for _ in range(self.plan.retakes):
             again = self.doubtful()
-            if not again:
-                return
             if self.witnesses.dark:
                 break
+            if not again:
+                return
             self.retakes += len(again)
             self.slots(again)
-        if self.doubtful():
+        if self.doubtful() or self.witnesses.dark:
             raise _Ended(FinishReason.SYNC_LOST, self.out_of_step())
 
     def slots(self, patterns: Sequence[int]) -> None:

@@ -89,7 +89,8 @@ def judge(plan: Plan, record: FrameRecord, next_flip: Flip | None) -> FrameVerdi
     if not outside and not partial:
         return FrameVerdict(record.pattern, "consistent" if believed else "proved", tuple(believed))
     certain = _certainly_outside(plan, exposure, flip, next_flip)
-    suspect = bool(certain) or not believed
+    # A static pattern's frame with a partial modulation period has wrong greys; no other frame would be more in step.
+    suspect = bool(certain) or (not believed and (bool(outside) or plan.mode is not Mode.STATIC))
     nominal = not partial and not _outside(plan, _exact(exposure), replace(flip, bound_ns=0), _sharp(next_flip))
     verdict: Verdict = "consistent" if nominal and believed and not certain else "unproved"
     return FrameVerdict(record.pattern, verdict, (*outside, *partial, *certain, *believed), suspect)

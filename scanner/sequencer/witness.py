@@ -19,9 +19,9 @@ from scanner.devices import Pixels
 from scanner.patterns import FrameRole, PatternSequence
 from scanner.patterns.sequence import SENTINELS_AFTER, SENTINELS_BEFORE
 
-SENTINEL_TOLERANCE = 0.08
+SENTINEL_TOLERANCE = 0.05
 """Share of the contrast by which equal sentinels may differ. Lamps drift by 1-3 % in seconds and mains light adds as
-much; a blend of two patterns by this share moves a phase by 0.08 x 2 pi / N at most, far from half a fringe."""
+much; a blend of two patterns by this share moves a phase by 0.05 x 2 pi / N at most, far from half a fringe."""
 
 NOISE_SIGMAS = 5.0
 """What is called lit, or different, stands this far above the noise."""
@@ -153,7 +153,7 @@ def look(sequence: PatternSequence, thumbnails: Mapping[int, Pixels], max_value:
     """Take the thumbnails as samples: noise, lit pixels. None if no pixel changes beyond the noise."""
     frames = {p: pixels.reshape(-1).astype(np.float32) for p, pixels in sorted(thumbnails.items())}
     shape = next(iter(thumbnails.values())).shape
-    noise = _noise(sequence, frames)
+    noise = _noise(sequence, frames, (int(shape[0]), int(shape[1])))
     stack = np.stack(list(frames.values()))
     # The second largest minus the second smallest: one frame's outliers (a cosmic ray, a torn frame) light nothing.
     ranked = np.sort(stack, axis=0)
@@ -189,21 +189,31 @@ def equal_positions(sequence: PatternSequence) -> Iterable[tuple[float, tuple[in
     return [(level, tuple(sorted(positions))) for level, positions in levels.items()]
 
 
-def _noise(sequence: PatternSequence, frames: Mapping[int, Array]) -> float:
+def _noise(sequence: PatternSequence, frames: Mapping[int, Array], shape: tuple[int, int]) -> float:
     """Of the pairs of equal frames, full-on ones if there are any since they are noisier, the pair that differs least.
 
-    A pair without any difference is one frame twice and says nothing. Without pairs: differences from frame to frame
-    in the darkest quarter of the pixels, where scattered pattern light is small. Never below rounding.
+    A pair without any difference is one frame twice and says nothing. Planned equals may all be false, so no more is
+    believed than the grain of differences between any frames shows. Never below rounding.
     """
+    grain = float(np.quantile([_grain(frames[a] - frames[b], shape) for a, b in pairwise(sorted(frames))], 0.25))
     for _, positions in sorted(equal_positions(sequence), reverse=True):
         here = [p for p in positions if p in frames]
         found = [sigma_between(*_brighter(frames[a], frames[b])) for a, b in combinations(here, 2)]
         if found := [sigma for sigma in found if sigma > 0]:
-            return max(min(found), LEAST_NOISE)
-    stack = np.stack(list(frames.values()))
-    mean = stack.mean(axis=0)
-    dark = stack[:, mean <= np.quantile(mean, 0.25)]
-    return max(float(np.median([sigma_between(a, b) for a, b in pairwise(dark)])), LEAST_NOISE)
+            return max(min([*found, max(3 * grain, LEAST_NOISE)]), LEAST_NOISE)
+    return max(grain, LEAST_NOISE)
+
+
+def _grain(difference: Array, shape: tuple[int, int]) -> float:
+    """1-sigma of one sample of two frames, from the roughness of their difference image.
+
+    Second differences along rows and along columns, whichever is smoother: projected stripes are smooth along one of
+    them, and a texture scales with the light, which varies slowly. Median absolute value of a normal / 0.6745; a
+    second difference of the difference of two frames has 12 variances.
+    """
+    image = difference.reshape(shape)
+    rough = [float(np.median(np.abs(np.diff(image, 2, axis=axis)))) for axis in (0, 1) if image.shape[axis] > 2]
+    return min(rough, default=0.0) / 0.6745 / 12**0.5
 
 
 def _brighter(a: Array, b: Array) -> tuple[Array, Array]:
@@ -268,7 +278,7 @@ def _explain_sentinels(
     partial = [p for p in wrong if tolerance < levels[p] < 1 - tolerance]
     if len(partial) >= 2:
         named = ", ".join(f"{p} at {levels[p]:.0%}" for p in partial)
-        return f"sentinels are blends of two patterns ({named} of white): exposures straddle the flips", True
+        return f"sentinels are neither black nor white ({named} of white): exposures straddle the flips", True
     return f"sentinels {', '.join(map(str, wrong))} do not show the black or white that was planned", True
 
 

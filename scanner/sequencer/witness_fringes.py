@@ -22,6 +22,7 @@ from scanner.sequencer.fringe_fit import (
     clipped_pixels,
     design_matrix,
     fit_set,
+    mean_vector,
     solve,
 )
 from scanner.sequencer.witness import Array, Scene, Witness, equal_positions, sigma_between
@@ -38,12 +39,16 @@ GAIN_VARIED, GAIN_NARROW = 0.6, 0.35
 """Another order is believed when it brings the residual down to this share of what it was. In a scene that shows all
 phases no response can look like another order; where it shows few, a bent response at one phase may."""
 
-COPY_SIGMAS = 1.3
-"""Two frames that differ by no more than this, over the noise of full-on frames, are one picture."""
+COPY_SIGMAS = 1.15
+"""Two frames that differ by no more than this, over the noise of full-on frames, are one picture: they are darker, so
+their own noise is less."""
 
-MAX_MEAN_DIFFERENCE = 0.2
-"""Of a set's mean from the others', rms over B, gain taken out. A doubled frame among three leaves .41; the third
-harmonic of an uncorrected gamma 2.2 leaves .05."""
+COPY_EXPECTED = 6.0
+"""Only frames that should differ by this much more than the noise are compared."""
+
+MAX_MEAN_DIFFERENCE = 0.06
+"""Of a set's mean from the others', rms over B, gain and noise taken out. A doubled frame among three leaves .41, one
+blended by a seventh .06; the third harmonic of an uncorrected gamma 2.3 leaves .03."""
 
 
 def fringe_witnesses(scene: Scene, cannot: list[str]) -> list[Witness]:
@@ -101,7 +106,7 @@ def _explained(
     fit: Fit, others: Sequence[Fit], bright: NDArray[np.bool_], left: float, noise: float
 ) -> tuple[tuple[int, ...], str] | None:
     """Frames whose exchange, or whose showing another shift, explains the residual; and that in words."""
-    gain = GAIN_VARIED if _length(fit, bright) < 0.5 else GAIN_NARROW
+    gain = GAIN_VARIED if mean_vector(fit, bright) < 0.5 else GAIN_NARROW
     design, frames, b = design_matrix(fit.alpha), fit.frames[:, bright], fit.modulation[bright]
     if (pair := _exchange(design, frames, b, gain * left)) is not None:
         wrong = tuple(sorted(fit.positions[n] for n in pair))
@@ -216,7 +221,8 @@ def _means(scene: Scene, fits: Sequence[Fit], clipped: NDArray[np.bool_]) -> lis
     gains = np.median(means / np.maximum(span, 1), axis=1, keepdims=True)
     value = np.sqrt(np.median(((means - gains * span) / b) ** 2, axis=1)) / 0.6745
     noise = scene.noise / float(np.median(b)) / np.sqrt([len(fit.positions) for fit in fits])
-    limit = MAX_MEAN_DIFFERENCE / (2 if references is None and len(fits) == 2 else 1) + 3 * noise
+    value = np.sqrt(np.maximum(value**2 - noise**2, 0))
+    limit = MAX_MEAN_DIFFERENCE / (2 if references is None and len(fits) == 2 else 1) + noise
     wrong = [fits[int(i)] for i in np.flatnonzero(value > limit)]
     frames = tuple(sorted(p for fit in wrong for p in fit.positions))
     worst = int(np.argmax(value / limit))
@@ -257,7 +263,7 @@ def _copies(scene: Scene, fits: Sequence[Fit]) -> list[Witness]:
                 expected = 8 * noise
                 if later is fit:
                     expected = sigma_between(fit.model(i)[use], fit.model(j)[use])
-                if expected < 4 * noise:
+                if expected < COPY_EXPECTED * noise:
                     continue
                 nearest = min(nearest, difference / noise)
                 if difference <= min(COPY_SIGMAS * noise, 0.4 * expected):
@@ -271,12 +277,7 @@ def _copies(scene: Scene, fits: Sequence[Fit]) -> list[Witness]:
 
 def _varied(fit: Fit, use: NDArray[np.bool_]) -> bool:
     """Whether the scene shows enough of the set's phases for two frames not to be alike by chance."""
-    return _length(fit, use) < 0.9
-
-
-def _length(fit: Fit, use: NDArray[np.bool_]) -> float:
-    """Length of the mean phase vector: 1 where the scene shows one phase only, 0 where it shows all alike."""
-    return float(np.abs(np.exp(2j * np.pi * fit.cycles[use]).mean()))
+    return mean_vector(fit, use) < 0.9
 
 
 def _pairs(fit: Fit, later: Fit) -> list[tuple[int, int]]:

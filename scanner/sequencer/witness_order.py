@@ -18,8 +18,11 @@ from scanner.errors import DecodeError
 from scanner.patterns import PmpPattern
 from scanner.patterns.description import Axis
 from scanner.patterns.sequence import BAR_COUNT, bar_light
-from scanner.sequencer.fringe_fit import MIN_PIXELS, Fit, bright_pixels
+from scanner.sequencer.fringe_fit import MIN_PIXELS, Fit, bright_pixels, mean_vector
 from scanner.sequencer.witness import Array, Scene, Witness
+
+LEAST_OFFSET = 0.05
+"""Mean remainder, in fringes, that is allowed in any case: interreflections and slow drift of the lamp."""
 
 HYPOTHESIS_GAIN = 0.35
 """A turned set is believed when it makes the remainders agree by so much better (mean cosine)."""
@@ -118,7 +121,8 @@ def _remainders(
     for j, (errors, vector) in enumerate(zip(ladder.errors, vectors, strict=True)):
         concerned = [k for k, weight in enumerate(errors) if abs(weight) > 1e-9]
         expected = float(np.exp(-2 * np.pi**2 * np.sum(errors**2 * noise2)))
-        items.append(_step(fits, ladder, j, vector, expected, concerned, cannot))
+        varied = all(mean_vector(fits[k], use) < 0.5 for k in concerned)
+        items.append(_step(fits, ladder, j, vector, expected, concerned, varied, cannot))
     return items
 
 
@@ -129,14 +133,19 @@ def _step(
     vector: complex,
     expected: float,
     concerned: Sequence[int],
+    varied: bool,
     cannot: list[str],
 ) -> Witness:
     low, high = ladder.frequencies[j], ladder.frequencies[j + 1]
     axis = fits[0].fringe_set.axis
     name = f"remainder {low:g}:{high:g} {axis}"
-    # Half a frame's step of the set with most shifts; sets of few shifts have response errors, and move far.
-    limit = max(0.05, 0.5 / max(fits[k].fringe_set.shifts for k in concerned))
     offset, length = float(np.angle(vector)) / (2 * np.pi), float(np.abs(vector))
+    # Half a frame's step of the set with most shifts. A scene that shows all phases averages response errors out as
+    # far as it shows them by their spread: there what lies beyond the spread is disorder.
+    limit = max(LEAST_OFFSET, 0.5 / max(fits[k].fringe_set.shifts for k in concerned))
+    if varied:
+        spread = float(np.sqrt(2 * max(0.0, np.log(expected / max(length, 1e-6))))) / (2 * np.pi)
+        limit = min(limit, LEAST_OFFSET + spread)
     frames = tuple(sorted(p for k in concerned for p in fits[k].positions))
     if length > 0.5:
         passed = abs(offset) <= limit
