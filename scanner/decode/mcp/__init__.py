@@ -7,6 +7,7 @@ soft:
     stripes     pitch from the columns' spectrum; peaks and valleys in every fourth column      4.1
     linking     peaks chained along the stripes; evidence passed along them                     (5.4 grows regions)
     carriers    brightness along the chains; the magnification at which all carriers stand out  4.3
+    magnification  where the carriers lie at each peak: a smooth field                         (4.3 has one for all)
     emissions   amplitude of each carrier over local brightness; likelihood of each stripe      4.4, 4.5
     hmm         one model over both kinds of stripe: Viterbi and forward-backward               5.2, 5.3
     subpixel    the profile averaged along the stripe, odd part fitted                          (not in the source)

@@ -2,8 +2,9 @@
 
 The projected carriers are the prior: all of them are magnified alike, so one number, camera pixels per projector
 pixel along the stripes, places them all (where the dissertation searches each by analysis-by-synthesis, 4.3, and
-takes one band's lobes for two carriers). The magnification varies by some per cent over the image, on a convergent
-rig by keystone and with depth; a field linear in x, y and x y follows it.
+takes one band's lobes for two carriers). That number drifts over the image, by some per cent with the projector above
+the camera and by a tenth to either side with it beside: spectra are taken in tiles, and the drift is searched too.
+`magnification` follows it closer.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from scipy.fft import rfft
 from scanner.decode.mcp.linking import Chains
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.stripes import STEP, Image, Peaks
-from scanner.kernel import kernel, summing_kernel
+from scanner.kernel import kernel
 
 Array = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -27,11 +28,16 @@ SCALE_RANGE = 2.2
 """The magnification along the stripes lies within this factor of the one across them, known from the pitch: a surface
 seen at 60 degrees, or projector pixels twice as wide as high."""
 
-FIELD_RANGE = 0.07
-"""Magnifications searched locally, relative to the mean: keystone makes 2.7 % (mcp.md, Pitfalls), depth as much."""
+DRIFT_Y = np.arange(-0.18, 0.181, 0.02)
+DRIFT_X = np.arange(-0.09, 0.091, 0.03)
+"""Drifts searched, from the image's middle to its border, natural logarithms: across the stripes (a projector at 15
+degrees to the camera drifts by .1 over 20 degrees of view) and along them."""
 
-FIELD_STEP = 0.005
-"""Steps of the tables of emissions: .05 cycles at the end of a window of 20 periods."""
+TILES_Y, TILES_X = 6, 2
+"""Tiles of the search. Narrow across the stripes, where the drift is."""
+
+LOG_STEP = 0.004
+"""Steps of the magnification: a quarter of a bin at the highest carrier."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,50 +108,102 @@ def _signals(
 
 @dataclass(frozen=True)
 class CarrierSearch:
-    """scale: camera px per projector px along the stripes. contrast: (N,) each carrier's amplitude over what lies
-    between the carriers.
+    """scale: camera px per projector px along the stripes, in the image's middle; drift_x, drift_y: its change to the
+    image's border, natural logarithm. contrast: (N,) each carrier's amplitude over what lies between the carriers.
     """
 
     scale: float
+    drift_x: float
+    drift_y: float
     contrast: tuple[float, ...]
 
+    def relative(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float64]:
+        """Magnification over `scale` at places -1 .. 1 across the image."""
+        return np.asarray(np.exp(self.drift_x * x + self.drift_y * y))
 
-def search_carriers(signals: Signals, chains: Chains, model: PatternModel, around: float) -> CarrierSearch:
-    """Find the magnification at which all carriers stand out of the chains' spectrum.
+
+def places(peaks: Peaks, chains: Chains, shape: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where the peaks lie in an image of `shape` (H, W): x and y from -1 to 1."""
+    x = chains.column.astype(np.float64) * (2.0 * STEP / shape[1]) - 1
+    return x, peaks.y.astype(np.float64) * (2.0 / shape[0]) - 1
+
+
+def search_carriers(
+    signals: Signals, peaks: Peaks, chains: Chains, model: PatternModel, around: float, shape: tuple[int, int]
+) -> CarrierSearch:
+    """Find the magnification, and its drift, at which all carriers stand out of the chains' spectra.
 
     Args:
         signals: P peaks' brightness.
+        peaks: the peaks.
         chains: their chains.
         model: the pattern's tables.
         around: magnification expected, from the pitch.
+        shape: (H, W) of the image.
     """
     # Long enough to part the two nearest carriers at the largest magnification's period.
     size = int(np.clip(2 ** np.ceil(np.log2(2.0 * around / model.separation)), 64, 1024))
-    spectrum = _mean_spectrum(signals.light, chains, size)
-    if spectrum is None:
-        return CarrierSearch(around, (0.0,) * model.channels)
-    frequency = np.arange(len(spectrum)) / (2 * (len(spectrum) - 1))
-    scales = around * np.exp(np.arange(-np.log(SCALE_RANGE), np.log(SCALE_RANGE), 0.004))
-    ordered = np.sort(model.carriers)
-    between = np.concatenate(
-        ([ordered[0] - model.separation / 2], (ordered[1:] + ordered[:-1]) / 2, [ordered[-1] + model.separation / 2])
-    )
+    steps = np.arange(-np.log(SCALE_RANGE), np.log(SCALE_RANGE), LOG_STEP)
+    scales = around * np.exp(steps)
     # Beyond .45 cycles a pixel neither columns of four pixels nor a blurred lens show a carrier.
-    scales = scales[ordered[-1] / scales <= 0.45]
-    if not len(scales):
-        return CarrierSearch(around, (0.0,) * model.channels)
+    scales = scales[float(model.carriers.max()) / scales <= 0.45]
+    power, middle = _spectra(signals.light, chains, size)
+    if not len(power) or len(scales) < 2:
+        return CarrierSearch(around, 0.0, 0.0, (0.0,) * model.channels)
+    x, y = (place[middle] for place in places(peaks, chains, shape))
+    column = np.clip(((x + 1) * (TILES_X / 2)).astype(int), 0, TILES_X - 1)
+    tile = np.clip(((y + 1) * (TILES_Y / 2)).astype(int), 0, TILES_Y - 1) * TILES_X + column
+    logs, weights, at = [], [], []
+    for t in np.unique(tile):
+        inside = tile == t
+        logs.append(_contrasts(np.sqrt(power[inside].mean(axis=0)), scales, model))
+        weights.append(np.sqrt(inside.sum()))
+        at.append((x[inside].mean(), y[inside].mean()))
+    return _align(np.stack(logs), np.asarray(weights), np.asarray(at), scales)
+
+
+def _contrasts(spectrum: NDArray[np.float64], scales: NDArray[np.float64], model: PatternModel) -> NDArray[np.float64]:
+    """Logarithm of each carrier's amplitude over what lies to its two sides, at each magnification: (Q, N)."""
+    frequency = np.arange(len(spectrum)) / (2 * (len(spectrum) - 1))
+    ordered = np.sort(model.carriers)
+    half = model.separation / 2
+    between = np.concatenate(([ordered[0] - half], (ordered[1:] + ordered[:-1]) / 2, [ordered[-1] + half]))
     on = np.interp(model.carriers[None, :] / scales[:, None], frequency, spectrum)
     off = np.interp(between[None, :] / scales[:, None], frequency, spectrum)
     # Each carrier against its own two neighbours: a slope of the background favours none.
     rank = np.argsort(np.argsort(model.carriers))
-    ratio = on / np.maximum(np.sqrt(off[:, rank] * off[:, rank + 1]), 1e-9)
-    logs = np.log(np.maximum(ratio, 0.1))
-    best = int(np.argmax(logs.clip(-1, 1.5).sum(axis=1) + 0.5 * logs.min(axis=1)))
-    return CarrierSearch(float(scales[best]), tuple(float(r) for r in ratio[best]))
+    ground = np.sqrt(off[:, rank] * off[:, rank + 1])
+    return np.asarray(np.log(np.maximum(on / np.maximum(ground, 1e-9), 0.1)))
 
 
-def _mean_spectrum(light: Array, chains: Chains, size: int) -> NDArray[np.float64] | None:
-    """Mean amplitude spectrum of Hann windows of `size` samples along the chains, relative to their brightness."""
+def _align(
+    logs: NDArray[np.float64], weights: NDArray[np.float64], at: NDArray[np.float64], scales: NDArray[np.float64]
+) -> CarrierSearch:
+    """The magnification and drifts at which the tiles' contrasts (T, Q, N) agree best."""
+    score = logs.clip(-1, 1.5).sum(axis=2) + 0.5 * logs.min(axis=2)
+    score = score * weights[:, None]
+    index = np.arange(len(scales))[None, :]
+    best = (-np.inf, 0, 0.0, 0.0)
+    rows = np.arange(len(at))[:, None]
+    for drift_y in DRIFT_Y:
+        for drift_x in DRIFT_X:
+            shift = np.rint((at[:, 0] * drift_x + at[:, 1] * drift_y) / LOG_STEP).astype(int)[:, None]
+            # Without need no drift: a hundredth of the score for each tenth.
+            total = score[rows, np.clip(index + shift, 0, len(scales) - 1)].sum(axis=0)
+            total = total - 0.1 * (abs(drift_x) + abs(drift_y)) * np.abs(total)
+            q = int(np.argmax(total))
+            if total[q] > best[0]:
+                best = (float(total[q]), q, float(drift_x), float(drift_y))
+    _, q, drift_x, drift_y = best
+    own = np.clip(q + np.rint((at[:, 0] * drift_x + at[:, 1] * drift_y) / LOG_STEP).astype(int), 0, len(scales) - 1)
+    seen = np.average(logs[np.arange(len(at)), own], axis=0, weights=weights)
+    return CarrierSearch(float(scales[q]), drift_x, drift_y, tuple(float(c) for c in np.exp(seen)))
+
+
+def _spectra(light: Array, chains: Chains, size: int) -> tuple[NDArray[np.float64], Ints]:
+    """Power spectra of Hann windows of `size` samples along the chains, relative to their brightness, and the peak in
+    the middle of each.
+    """
     window = np.hanning(size).astype(np.float32)
     starts: list[int] = []
     lengths: list[int] = []
@@ -155,10 +213,8 @@ def _mean_spectrum(light: Array, chains: Chains, size: int) -> NDArray[np.float6
         elif last - first >= size // 3:
             starts.append(first)
         lengths.extend([min(last - first, size)] * (len(starts) - len(lengths)))
-    if not starts:
-        return None
-    thin = max(1, len(starts) // 256)  # enough for a mean
-    begin, length = np.asarray(starts)[::thin], np.asarray(lengths)[::thin]
+    thin = max(1, len(starts) // 384)  # enough for a mean in each tile
+    begin, length = np.asarray(starts, np.int64)[::thin], np.asarray(lengths, np.int64)[::thin]
     sample = np.arange(size)
     present = sample[None, :] < length[:, None]
     block = np.where(present, light[np.minimum(begin[:, None] + sample[None, :], len(light) - 1)], np.float32(0))
@@ -168,106 +224,5 @@ def _mean_spectrum(light: Array, chains: Chains, size: int) -> NDArray[np.float6
     # Dark pieces weigh by their own spread, or a valley's noise outweighs stripes.
     spread = np.sqrt((block**2).sum(axis=1, keepdims=True) / (window**2).sum())
     block /= np.maximum(np.maximum(np.abs(mean), spread), 1e-6)
-    amplitude = np.abs(rfft(block.astype(np.float32), 2 * size, axis=1))
-    return np.asarray(np.sqrt((amplitude**2).mean(axis=0)), np.float64)
-
-
-def window_px(model: PatternModel, scale: float) -> int:
-    """Samples of an emission's window: 1.5 beats of the two nearest carriers, a multiple of four.
-
-    A Hann window of that length parts them by least squares with a tenth of the noise lost.
-    """
-    beat = scale / model.separation
-    return int(STEP * np.clip(np.ceil(1.5 * beat / STEP), 6, 128))
-
-
-def fit_field(
-    light: Array, peaks: Peaks, chains: Chains, model: PatternModel, scale: float, size: int, shape: tuple[int, int]
-) -> Array:
-    """The magnification at each peak, from a robust fit of 1, x, y, x y to the windows' own best ones.
-
-    Args:
-        light: (4 P,) float32.
-        peaks, chains, model: as elsewhere.
-        scale: mean magnification.
-        size: window, samples.
-        shape: (H, W) px.
-
-    Returns:
-        (P,) float32: magnification relative to `scale`.
-    """
-    trial = np.arange(-FIELD_RANGE, FIELD_RANGE + 1e-9, 2 * FIELD_STEP)
-    t = np.arange(size) - (size - 1) / 2
-    window = np.hanning(size + 2)[1:-1]
-    starts, middles = [], []
-    for first, last in zip(chains.start[:-1], chains.start[1:], strict=True):
-        for a in range(int(first), int(last) - size // STEP + 1, max(1, size // (2 * STEP))):
-            starts.append(a)
-            middles.append(a + size // (2 * STEP))
-    if len(starts) < 8:
-        return np.ones(len(peaks), np.float32)
-    basis = np.empty((len(trial), 2 * model.channels, size), np.float32)
-    for j, delta in enumerate(trial):
-        phase = 2 * np.pi * t[None, :] * (model.carriers / (scale * (1 + delta)))[:, None]
-        basis[j, : model.channels], basis[j, model.channels :] = np.cos(phase), np.sin(phase)
-    power = np.zeros((len(starts), len(trial)), np.float32)
-    mean = np.zeros(len(starts), np.float32)
-    _powers(light, np.asarray(starts, np.int32) * STEP, window.astype(np.float32), basis, mean, power)
-    best = power.argmax(axis=1)
-    inside = (best > 0) & (best < len(trial) - 1) & (mean > 0)
-    row = np.arange(len(best))
-    b = np.clip(best, 1, len(trial) - 2)
-    left, top, right = power[row, b - 1], power[row, b], power[row, b + 1]
-    curve = left - 2 * top + right
-    shift = np.where(curve < 0, 0.5 * (left - right) / np.minimum(curve, -1e-12), 0.0)
-    value = trial[b] + np.clip(shift, -1, 1) * 2 * FIELD_STEP
-    # A window counts by how far its best stands above its middle: those without carriers have none.
-    weight = np.where(inside, top - np.median(power, axis=1), 0.0).clip(0, None)
-    at = chains.order[np.asarray(middles)]
-    height, width = shape
-    x, y = chains.column * (2.0 * STEP / width) - 1, peaks.y * (2.0 / height) - 1
-    design = np.stack([np.ones(len(x)), x, y, x * y], axis=1)
-    field = _robust_fit(design[at], value, weight, design)
-    return np.asarray(1 + np.clip(field, -FIELD_RANGE, FIELD_RANGE), np.float32)
-
-
-@summing_kernel
-def _powers(light: Array, starts: Ints, window: Array, basis: Array, mean: Array, power: Array) -> None:
-    """Power on all carriers over squared brightness, for each window and each trial magnification."""
-    trials, waves, size = basis.shape
-    piece = np.empty(size, np.float32)
-    total = np.float32(0)
-    for q in range(size):
-        total += window[q]
-    for n in range(len(starts)):
-        level = np.float32(0)
-        for q in range(size):
-            level += window[q] * light[starts[n] + q]
-        level /= total
-        mean[n] = level
-        for q in range(size):
-            piece[q] = (light[starts[n] + q] - level) * window[q]
-        for j in range(trials):
-            for w in range(waves):
-                wave = basis[j, w]
-                dot = np.float32(0)
-                for q in range(size):
-                    dot += piece[q] * wave[q]
-                power[n, j] += dot * dot
-            power[n, j] /= max(level * level, np.float32(1e-6))
-
-
-def _robust_fit(design: Any, value: Any, weight: Any, everywhere: Any) -> NDArray[np.float64]:
-    """Weighted least squares with Cauchy weights, four rounds; evaluated on the rows of `everywhere`."""
-    w = np.minimum(weight, np.percentile(weight, 90)) + 1e-12
-    spread = FIELD_RANGE / 2
-    ridge = np.diag([1e-9, 1e-3, 1e-3, 1e-2]) * w.sum()
-    centre = float(np.average(value, weights=w))
-    solution = np.zeros(4)
-    v = value - centre
-    for _ in range(5):
-        residual = v - design @ solution
-        c = w / (1 + (residual / spread) ** 2)
-        solution = np.linalg.solve(design.T @ (c[:, None] * design) + ridge, design.T @ (c * v))
-        spread = max(float(np.sqrt(np.average((v - design @ solution) ** 2, weights=c))), FIELD_STEP)
-    return np.asarray(centre + everywhere @ solution)
+    amplitude = np.abs(rfft(block.astype(np.float32), 2 * size, axis=1)) if len(block) else np.zeros((0, size + 1))
+    return np.asarray(amplitude**2, np.float64), chains.order[(begin + length // 2) // STEP]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Reason
-from scanner.decode.mcp import carriers, dense, emissions, hmm, linking, stripes, subpixel
+from scanner.decode.mcp import carriers, dense, emissions, hmm, linking, magnification, stripes, subpixel
 from scanner.decode.mcp.model import PatternModel
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
@@ -239,7 +239,9 @@ def _locate(image: Image, model: PatternModel, camera: CameraFormat, clock: _Sta
         found.fault = "no stripes stand out of the noise"
         return found
     with clock.stage("carriers"):
-        found.search = carriers.search_carriers(found.signals, found.chains, model, around)
+        found.search = carriers.search_carriers(
+            found.signals, found.peaks, found.chains, model, around, (image.shape[0], image.shape[1])
+        )
     contrast = np.asarray(found.search.contrast)
     if np.exp(np.log(np.maximum(contrast, 0.1)).mean()) < MIN_CONTRAST:
         shown = ", ".join(f"{c:.2f}" for c in contrast)
@@ -281,10 +283,10 @@ def _decide(found: _Found, model: PatternModel, clock: _Stages) -> _Decision:
     assert chains is not None  # noqa: S101
     assert search is not None  # noqa: S101
     assert signals is not None  # noqa: S101
-    size = carriers.window_px(model, search.scale)
+    size = magnification.window_px(model, search.scale)
     shape = (found.reduced.shape[1], found.reduced.shape[0] * stripes.STEP)
     with clock.stage("field"):
-        scale_field = carriers.fit_field(signals.light, peaks, chains, model, search.scale, size, shape)
+        scale_field = magnification.fit_field(signals.light, peaks, chains, model, search, size, shape)
     with clock.stage("emissions"):
         seen = emissions.measure(signals.light, chains, scale_field, model, search.scale, size)
     modulation = emissions.first_modulation(seen, model)
@@ -320,6 +322,7 @@ def _decide(found: _Found, model: PatternModel, clock: _Stages) -> _Decision:
         "pitch_match": round(found.match, 3),
         "noise_dn": round(found.noise, 3),
         "carrier_scale": round(search.scale, 5),
+        "carrier_drift": [round(search.drift_x, 3), round(search.drift_y, 3)],
         "carrier_contrast": [round(c, 2) for c in search.contrast],
         "modulation": [round(float(m), 3) for m in modulation],
         "noise_floor": [round(float(f), 4) for f in floor],

@@ -14,8 +14,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.mcp.carriers import FIELD_STEP
 from scanner.decode.mcp.linking import Chains
+from scanner.decode.mcp.magnification import FIELD_STEP
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.stripes import STEP
 from scanner.kernel import kernel, summing_kernel

@@ -1,0 +1,143 @@
+"""The magnification of the carriers at every peak: a smooth field about what the search found.
+
+Each window along a chain votes for the magnification at which most power lies on the carriers; a robust fit of
+1, x, y and x y to these votes follows keystone, and leaves out windows that hold no carriers or an object's edge.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode.mcp.carriers import CarrierSearch, places
+from scanner.decode.mcp.linking import Chains
+from scanner.decode.mcp.model import PatternModel
+from scanner.decode.mcp.stripes import STEP, Peaks
+from scanner.kernel import summing_kernel
+
+Array = NDArray[np.float32]
+Ints = NDArray[np.int32]
+
+FIELD_RANGE = 0.07
+"""Magnifications tried about the search's own, relative: what depth and the search's steps leave."""
+
+FIELD_STEP = 0.005
+"""Steps of the tables of emissions: .05 cycles at the end of a window of 20 periods."""
+
+MOST_WINDOWS = 300
+"""Windows that vote: the fit has four unknowns."""
+
+
+def window_px(model: PatternModel, scale: float) -> int:
+    """Samples of an emission's window: 1.5 beats of the two nearest carriers, a multiple of four.
+
+    A Hann window of that length parts them by least squares with a tenth of the noise lost.
+    """
+    beat = scale / model.separation
+    return int(STEP * np.clip(np.ceil(1.5 * beat / STEP), 6, 128))
+
+
+def fit_field(
+    light: Array,
+    peaks: Peaks,
+    chains: Chains,
+    model: PatternModel,
+    search: CarrierSearch,
+    size: int,
+    shape: tuple[int, int],
+) -> Array:
+    """The magnification at each peak.
+
+    Args:
+        light: (4 P,) float32.
+        peaks, chains, model: as elsewhere.
+        search: mean magnification and its drift.
+        size: window, samples.
+        shape: (H, W) px.
+
+    Returns:
+        (P,) float32: magnification relative to `search.scale`.
+    """
+    x, y = places(peaks, chains, shape)
+    base = search.relative(x, y) - 1
+    starts: list[int] = []
+    for first, last in zip(chains.start[:-1], chains.start[1:], strict=True):
+        starts.extend(range(int(first), int(last) - size // STEP + 1, max(1, size // (2 * STEP))))
+    if len(starts) < 8:
+        return np.asarray(1 + base, np.float32)
+    begin = np.asarray(starts, np.int32)[:: max(1, len(starts) // MOST_WINDOWS)]
+    middle = chains.order[begin + size // (2 * STEP)]
+    value, weight = _votes(light, begin * STEP, base[middle], model, search.scale, size)
+    design = np.stack([np.ones(len(x)), x, y, x * y], axis=1)
+    more = _robust_fit(design[middle], value - base[middle], weight, design)
+    return np.asarray(1 + base + np.clip(more, -FIELD_RANGE, FIELD_RANGE), np.float32)
+
+
+def _votes(
+    light: Array, begin: Ints, base: NDArray[np.float64], model: PatternModel, scale: float, size: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Each window's best magnification relative to `scale`, less 1, and its weight."""
+    step = 2 * FIELD_STEP
+    count = 2 * round(FIELD_RANGE / step) + 1
+    lowest = int(np.floor((base.min() - FIELD_RANGE) / step))
+    first = (np.rint((base - FIELD_RANGE) / step) - lowest).clip(0).astype(np.int32)
+    tries = (lowest + np.arange(int(first.max()) + count)) * step
+    t = np.arange(size) - (size - 1) / 2
+    phase = 2 * np.pi * (model.carriers / (scale * (1 + tries[:, None])))[:, :, None] * t[None, None, :]
+    basis = np.concatenate([np.cos(phase), np.sin(phase)], axis=1).astype(np.float32)
+    power = np.zeros((len(begin), count), np.float32)
+    mean = np.zeros(len(begin), np.float32)
+    _powers(light, begin, first, np.hanning(size + 2)[1:-1].astype(np.float32), basis, mean, power)
+    best = power.argmax(axis=1)
+    inside = (best > 0) & (best < count - 1) & (mean > 0)
+    row, b = np.arange(len(best)), np.clip(best, 1, count - 2)
+    left, top, right = power[row, b - 1], power[row, b], power[row, b + 1]
+    curve = left - 2 * top + right
+    shift = np.where(curve < 0, 0.5 * (left - right) / np.minimum(curve, -1e-12), 0.0)
+    # A window counts by how far its best stands above its middle: those without carriers have none.
+    weight = np.where(inside, top - np.median(power, axis=1), 0.0).clip(0, None)
+    return tries[first + b] + np.clip(shift, -1, 1) * step, weight
+
+
+@summing_kernel
+def _powers(light: Array, starts: Ints, first: Ints, window: Array, basis: Array, mean: Array, power: Array) -> None:
+    """Power on all carriers over squared brightness, for each window and each trial magnification."""
+    waves, size = basis.shape[1], basis.shape[2]
+    piece = np.empty(size, np.float32)
+    total = np.float32(0)
+    for q in range(size):
+        total += window[q]
+    for n in range(len(starts)):
+        level = np.float32(0)
+        for q in range(size):
+            level += window[q] * light[starts[n] + q]
+        level /= total
+        mean[n] = level
+        for q in range(size):
+            piece[q] = (light[starts[n] + q] - level) * window[q]
+        for j in range(power.shape[1]):
+            for w in range(waves):
+                wave = basis[first[n] + j, w]
+                dot = np.float32(0)
+                for q in range(size):
+                    dot += piece[q] * wave[q]
+                power[n, j] += dot * dot
+            power[n, j] /= max(level * level, np.float32(1e-6))
+
+
+def _robust_fit(design: Any, value: Any, weight: Any, everywhere: Any) -> NDArray[np.float64]:
+    """Weighted least squares with Cauchy weights, four rounds; evaluated on the rows of `everywhere`."""
+    w = np.minimum(weight, np.percentile(weight, 90)) + 1e-12
+    spread = FIELD_RANGE / 2
+    ridge = np.diag([1e-9, 1e-3, 1e-3, 1e-2]) * w.sum()
+    centre = float(np.average(value, weights=w))
+    solution = np.zeros(4)
+    v = value - centre
+    for _ in range(5):
+        residual = v - design @ solution
+        c = w / (1 + (residual / spread) ** 2)
+        solution = np.linalg.solve(design.T @ (c[:, None] * design) + ridge, design.T @ (c * v))
+        spread = max(float(np.sqrt(np.average((v - design @ solution) ** 2, weights=c))), FIELD_STEP)
+    return np.asarray(centre + everywhere @ solution)
