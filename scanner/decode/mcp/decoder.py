@@ -216,6 +216,7 @@ def _locate(image: Image, model: PatternModel, camera: CameraFormat, clock: _Sta
     low, high = (float(v) for v in np.percentile(found.reduced[::4, ::4], (1, 99)))
     if high - low < max(0.01 * camera.max_value, 6 * found.noise):
         state = "black" if high < 0.1 * camera.max_value else "saturated" if low > 0.9 * camera.max_value else "uniform"
+        state = f"{state} but for noise of {found.noise:.1f}" if found.noise > 0.01 * camera.max_value else state
         found.fault = f"no pattern: the image is {state} (grey levels {low:.0f} to {high:.0f})"
         found.hint = "check that the projector shows the pattern, its focus, and the exposure"
         return found

@@ -42,7 +42,7 @@ HEIGHT_FLOOR = 0.04
 BORDER = 0.15
 """Pitches from the image's border within which a peak counts as cut: less than a third of its flank is there."""
 
-LEAST_FLANK = 0.4
+LEAST_FLANK = 0.45
 """Least ratio of a stripe's two flanks: below it one is cut off by an edge of the object."""
 
 
@@ -171,13 +171,15 @@ def find_peaks(reduced: Array, pitch: float, carrier_px: float, noise: float, we
     if not len(heights):
         return _as_peaks(start, rows)
     floor = HEIGHT_FLOOR * float(np.percentile(heights, 99))
-    # The published pattern's modulated stripes are dim beside bright ones: those count by their neighbours' height.
-    beside = np.zeros_like(heights)
+    # The published pattern's modulated stripes are dim between two bright ones: those count by their neighbours.
     inner = np.ones(len(heights), bool)
     inner[start[:-1][start[:-1] < len(heights)]] = False
-    beside[1:] = np.where(inner[1:], heights[:-1], 0)
-    beside[:-1] = np.maximum(beside[:-1], np.where(inner[1:], heights[1:], 0))
-    dim = (beside >= floor) & (heights >= 0.3 * weakest * beside)
+    before, after = np.full_like(heights, np.inf), np.full_like(heights, np.inf)
+    before[1:] = np.where(inner[1:], heights[:-1], np.inf)
+    after[:-1] = np.where(inner[1:], heights[1:], np.inf)
+    beside = np.minimum(before, after)
+    beside[np.isinf(beside)] = 0
+    dim = (beside >= floor) & (heights >= 0.5 * weakest * beside)
     keep = ((heights >= floor) | dim) & (heights >= 8 * left)
     counts = np.add.reduceat(np.append(keep, False).astype(np.int32), np.minimum(start[:-1], len(keep)))
     counts[start[:-1] == start[1:]] = 0

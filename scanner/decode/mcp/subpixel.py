@@ -31,7 +31,7 @@ SLOPE_COLUMNS = 8
 REACH = 0.42
 """Half the fit window in pitches: the flanks without the rounded valley."""
 
-ROUGH = np.float32(0.12)
+ROUGH = np.float32(0.1)
 """Residual of the odd part, as a share of the stripe's height, above which it is no whole stripe: a triangle cut off at
 a third of its flank leaves as much."""
 
