@@ -193,8 +193,10 @@ def _follower(folder: Path, lines: ProgressLines) -> Callable[[Event], None]:
                 lines.stage("preparing")
             case "plan":
                 check_room(folder, int(fields["bytes"]))
-            case "frame":
+            case "frame" | "acquiring":  # the latter is the state that stands for events that were lost
                 done, total = int(fields.get("captured", 0)), int(fields.get("total", 0))
+                if not total:
+                    return
                 lines.stage("capturing", total)
                 lines.advance(done, total, f"{done} of {total} frames")
             case "retake":
