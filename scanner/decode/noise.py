@@ -1,0 +1,68 @@
+"""How noisy a grey level is: shot and read noise as variance = read + per_level x level, in grey levels.
+
+Estimated from what repeated or redundant frames leave (`fit_noise`), and a cautious default for captures that leave
+nothing. This file does not know where the residuals come from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+ROUNDING_VARIANCE = 1 / 12
+"""Variance of rounding to whole grey levels; no frame is better."""
+
+DEFAULT_FULL_WELL_E = 10_000
+"""Electrons at the top of the range of a small-pixel industrial camera, for captures that show no noise of their own."""
+
+DEFAULT_READ_SHARE = 0.004
+"""Its read noise as a share of the range (1 grey level of 8 bits)."""
+
+_LEVELS = 12
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Variance of one sample: read + per_level x its expected grey level, never below that of rounding."""
+
+    read: float
+    per_level: float
+    measured: bool
+    """from this capture, and not the default"""
+
+    def variance(self, level: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Variance at expected grey levels `level`, any shape."""
+        return np.asarray(np.maximum(self.read + self.per_level * level, ROUNDING_VARIANCE), dtype=np.float32)
+
+
+def default_noise(max_value: int) -> NoiseModel:
+    """The model for a camera of which nothing is known but its largest grey level."""
+    return NoiseModel((DEFAULT_READ_SHARE * max_value) ** 2, max_value / DEFAULT_FULL_WELL_E, measured=False)
+
+
+def fit_noise(level: NDArray[np.float32], squares: NDArray[np.float32], freedom: int, max_value: int) -> NoiseModel:
+    """The model that fits the residuals of this capture.
+
+    Args:
+        level: (n,) float32 mean grey level. squares: (n,) float32 sum of squared residuals.
+        freedom: degrees of freedom of each sum. max_value: largest grey level of the camera.
+
+    Medians in bins of equal count stand against pixels that moved or are mixed; the median of a chi-square variable of
+    k degrees is k (1 - 2 / (9 k))^3 (Wilson and Hilferty 1931). Fewer than 100 samples, or no freedom, give the default.
+    """
+    if freedom < 1 or level.size < 100:
+        return default_noise(max_value)
+    bins = np.array_split(np.argsort(level), _LEVELS)
+    x = np.array([np.median(level[b]) for b in bins], dtype=np.float64)
+    y = np.array([np.median(squares[b]) for b in bins], dtype=np.float64) / (freedom * (1 - 2 / (9 * freedom)) ** 3)
+    # A variance's own error grows with it: weights 1 / y, one round of which is enough for two parameters.
+    w = 1 / np.maximum(y, ROUNDING_VARIANCE)
+    slope, read = np.polyfit(x, y, 1, w=w) if np.ptp(x) > 1 else (0.0, float(np.median(y)))
+    if slope < 0:
+        slope, read = 0.0, float(np.average(y, weights=w))
+    elif read < ROUNDING_VARIANCE:
+        read = ROUNDING_VARIANCE
+        slope = max(float(np.sum(w**2 * x * (y - read)) / max(np.sum(w**2 * x * x), 1e-12)), 0.0)
+    return NoiseModel(max(float(read), ROUNDING_VARIANCE), float(slope), measured=True)
