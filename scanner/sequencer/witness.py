@@ -23,6 +23,10 @@ SENTINEL_TOLERANCE = 0.05
 """Share of the contrast by which equal sentinels may differ. Lamps drift by 1-3 % in seconds and mains light adds as
 much; a blend of two patterns by this share moves a phase by 0.05 x 2 pi / N at most, far from half a fringe."""
 
+BLACK_TOLERANCE, FLICKER = 0.015, 0.1
+"""The lamp does not shine on full-off frames: they may differ by so much, and by the flicker of the ambient light, of
+which mains light has up to a tenth over exposures that are no multiple of its period."""
+
 NOISE_SIGMAS = 5.0
 """What is called lit, or different, stands this far above the noise."""
 
@@ -234,17 +238,20 @@ def _sentinels(scene: Scene, cannot: list[str]) -> list[Witness]:
     if len(here) < 4:
         cannot.append("frames that all come late by whole patterns (no sentinels)")
         return []
-    levels = _levels(scene, planned)
-    wrong = [p for p in here if abs(levels[p] - planned[p]) > SENTINEL_TOLERANCE]
-    value = max(abs(levels[p] - planned[p]) for p in here)
+    levels, ambient = _levels(scene, planned)
+    dark = min(SENTINEL_TOLERANCE, BLACK_TOLERANCE + FLICKER * ambient)
+    off = {p: abs(levels[p] - planned[p]) / (SENTINEL_TOLERANCE if planned[p] else dark) for p in here}
+    wrong = [p for p in here if off[p] > 1]
+    worst = max(here, key=lambda p: off[p])
+    value, limit = abs(levels[worst] - planned[worst]), SENTINEL_TOLERANCE if planned[worst] else dark
     if not wrong:
-        return [Witness("sentinels", True, value, SENTINEL_TOLERANCE, says="black and white frames are where planned")]
+        return [Witness("sentinels", True, value, limit, says="black and white frames are where planned")]
     says, whole = _explain_sentinels(scene, levels, planned, wrong)
-    return [Witness("sentinels", False, value, SENTINEL_TOLERANCE, tuple(wrong), says, whole)]
+    return [Witness("sentinels", False, value, limit, tuple(wrong), says, whole)]
 
 
-def _levels(scene: Scene, planned: Mapping[int, float]) -> dict[int, float]:
-    """Level of every frame, 0 = black, 1 = white, over the lit pixels.
+def _levels(scene: Scene, planned: Mapping[int, float]) -> tuple[dict[int, float], float]:
+    """Level of every frame over the lit pixels, 0 = black, 1 = white; and the ambient light on that scale.
 
     The scale is set by the medians of planned blacks and whites if these stand apart, so that one false sentinel does
     not move it; else by the darkest and brightest frame there is.
@@ -255,7 +262,8 @@ def _levels(scene: Scene, planned: Mapping[int, float]) -> dict[int, float]:
     low, high = min(means.values()), max(means.values())
     if not white - black > 0.75 * (high - low):
         black, white = low, high
-    return {p: (mean - black) / max(white - black, 1e-6) for p, mean in means.items()}
+    span = max(white - black, 1e-6)
+    return {p: (mean - black) / span for p, mean in means.items()}, black / span
 
 
 def _explain_sentinels(
@@ -274,7 +282,9 @@ def _explain_sentinels(
             count = "the pattern" if abs(lag) == 1 else f"the pattern {abs(lag)} places"
             return f"every frame shows {count} {side} its own: light comes later or earlier than planned", True
     if len(wrong) == 1:
-        return f"sentinel {wrong[0]} is at {levels[wrong[0]]:.0%} of white, planned {planned[wrong[0]]:.0%}", False
+        # A wholly false one is a stale or lost frame of its own; a blend is a matter of timing, which all share.
+        blend = abs(levels[wrong[0]] - planned[wrong[0]]) < 1 - tolerance
+        return f"sentinel {wrong[0]} is at {levels[wrong[0]]:.0%} of white, planned {planned[wrong[0]]:.0%}", blend
     partial = [p for p in wrong if tolerance < levels[p] < 1 - tolerance]
     if len(partial) >= 2:
         named = ", ".join(f"{p} at {levels[p]:.0%}" for p in partial)

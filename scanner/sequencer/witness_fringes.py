@@ -220,7 +220,9 @@ def _means(scene: Scene, fits: Sequence[Fit], clipped: NDArray[np.bool_]) -> lis
     # Lamps drift and mains light beats: one gain a set is taken out; disorder differs from pixel to pixel.
     gains = np.median(means / np.maximum(span, 1), axis=1, keepdims=True)
     value = np.sqrt(np.median(((means - gains * span) / b) ** 2, axis=1)) / 0.6745
-    noise = scene.noise / float(np.median(b)) / np.sqrt([len(fit.positions) for fit in fits])
+    # The references are medians of three frames each (variance pi / 2 / 3), of which the mean takes about a half.
+    own = np.array([1 / len(fit.positions) for fit in fits])
+    noise = scene.noise / float(np.median(b)) * np.sqrt(own + (0.26 if references is not None else own.mean()))
     value = np.sqrt(np.maximum(value**2 - noise**2, 0))
     limit = MAX_MEAN_DIFFERENCE / (2 if references is None and len(fits) == 2 else 1) + noise
     wrong = [fits[int(i)] for i in np.flatnonzero(value > limit)]
