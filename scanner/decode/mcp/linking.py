@@ -24,6 +24,11 @@ BEND = 0.05
 """Distance of a peak from its chain's line, in pitches to a column, that ends the chain."""
 
 
+LEAST_HEIGHT = 0.1
+"""Ratio of heights from one column to the next that ends a chain: more than print on paper makes, less than an edge of
+light and shadow."""
+
+
 @dataclass(frozen=True, eq=False)
 class Chains:
     """order: (P,) int32, peaks chain by chain, left to right. start: (C + 1,) int32, where chains begin in `order`.
@@ -67,7 +72,7 @@ def _link(start: Ints, y: Array, height: Array, reach: np.float32, bend: np.floa
     after = np.full(count, -1, np.int32)
     before = np.full(count, -1, np.int32)
     slope = np.zeros(count, np.float32)
-    third = np.float32(1 / 3)
+    least = np.float32(LEAST_HEIGHT)
     for b in range(len(start) - 2):
         j = start[b + 1]
         for i in range(start[b], start[b + 1]):
@@ -77,7 +82,7 @@ def _link(start: Ints, y: Array, height: Array, reach: np.float32, bend: np.floa
             k = _nearest(y, j, min(j + 3, start[b + 2]), target)
             if k < 0 or abs(y[k] - y[i]) > reach or abs(y[k] - target) > bend:
                 continue
-            if height[k] < third * height[i] or height[i] < third * height[k]:
+            if height[k] < least * height[i] or height[i] < least * height[k]:
                 continue
             if before[k] >= 0:  # two claim it: the nearer keeps it
                 other = before[k]

@@ -1,0 +1,211 @@
+"""The MCP decoder's stages against plain forms: sums written out, every path enumerated, signals made by formula."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from scanner.decode.mcp import carriers, dense, emissions, hmm, linking, magnification, stripes, subpixel
+from scanner.decode.mcp.model import PatternModel
+from scanner.patterns import McpPattern, ProjectorSize
+
+PROJECTOR = ProjectorSize(1152, 864)
+OWN = PatternModel.of(McpPattern(), PROJECTOR)
+PUBLISHED = PatternModel.of(
+    McpPattern(carriers=(90.0, 106.0, 120.0, 132.0), codes=tuple(range(16)), levels="composite"), PROJECTOR
+)
+
+
+@pytest.mark.parametrize("model", [OWN, PUBLISHED], ids=["own", "published"])
+def test_the_model_agrees_with_the_projected_image(model):
+    pattern = (
+        McpPattern()
+        if model is OWN
+        else McpPattern(carriers=(90.0, 106.0, 120.0, 132.0), codes=tuple(range(16)), levels="composite")
+    )
+    image = pattern.fringe(0, PROJECTOR)
+    for stripe in range(model.stripes):
+        line = image[round((stripe + 0.5) * model.pitch - 0.5)]
+        assert line.mean() == pytest.approx(model.level[stripe], abs=1e-3)
+        for i, carrier in enumerate(model.carriers):
+            wave = np.exp(-2j * np.pi * carrier * np.arange(len(line)))
+            amplitude = 2 * abs((line * wave).mean())
+            assert amplitude == pytest.approx(model.ratio[stripe, i] * model.level[stripe], abs=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_columns_are_averaged_by_fours(dtype):
+    image = np.random.default_rng(0).integers(0, 255, (37, 23)).astype(dtype)
+    expected = image[:, :20].reshape(37, 5, 4).mean(axis=2).T
+    np.testing.assert_allclose(stripes.reduce_columns(image), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("model", [OWN, PUBLISHED], ids=["own", "published"])
+@pytest.mark.parametrize("pitch", [8.0, 21.0, 37.0, 90.0])
+def test_the_pitch_is_found_and_is_no_pair_of_stripes(model, pitch):
+    rows = np.arange(900) / pitch + 3.3
+    column = np.interp(rows % model.stripes, (np.arange(len(model.column)) + 0.5) / 16, model.column)
+    reduced = np.tile(np.float32(20 + 100 * column), (16, 1))
+    found, match = stripes.estimate_pitch(reduced, model)
+    assert found == pytest.approx(pitch, rel=0.05)
+    assert match > 0.5
+
+
+def test_peaks_of_a_triangle_wave():
+    y = np.arange(400)
+    line = 10 + 80 * (1 - np.abs(2 * ((y - 7.25) / 40 % 1) - 1))
+    reduced = np.tile(np.float32(line), (12, 1))
+    peaks = stripes.find_peaks(reduced, 40.0, 16.0, 0.1)
+    assert (np.diff(peaks.start) == 10).all()
+    np.testing.assert_allclose(peaks.y[:10], 27.25 + 40 * np.arange(10), atol=0.1)
+    # Smoothing by a twelfth of a pitch takes .16 of the height at the top and as much at the valleys.
+    assert ((peaks.height[1:9] > 55) & (peaks.height[1:9] < 80)).all()
+    assert ((peaks.valley[1:9] > 10) & (peaks.valley[1:9] < 25)).all()
+    chains = linking.link(peaks, 40.0)
+    assert (chains.lengths == 12).all()
+    assert sorted(chains.order) == list(range(120))
+    fine = subpixel.refine(reduced, peaks, chains, np.tile(np.arange(10, dtype=np.int32), 12), 40.0)
+    np.testing.assert_allclose(fine.y[1:9], 67.25 + 40 * np.arange(8), atol=0.03)
+
+
+def test_a_slope_of_brightness_does_not_move_the_peak():
+    y = np.arange(400)
+    light = 1 - np.abs(2 * ((y - 7.25) / 40 % 1) - 1)
+    reduced = np.tile(np.float32(10 + light * (60 + 0.5 * (y - 200))), (24, 1))
+    peaks = stripes.find_peaks(reduced, 40.0, 16.0, 0.1)
+    count = int(peaks.start[1])
+    label = np.tile(np.arange(count, dtype=np.int32), 24)
+    fine = subpixel.refine(reduced, peaks, linking.link(peaks, 40.0), label, 40.0)
+    error = (fine.y - 27.25 + 20) % 40 - 20
+    inside = (fine.y > 150) & (fine.y < 380)
+    assert np.abs(error[inside]).max() < 0.12
+
+
+def columns_case(seed, size=5, states=4):
+    """Random evidence of one column, and every assignment of stripe or none to its peaks with its probability."""
+    random = np.random.default_rng(seed)
+    evidence = random.normal(0, 2, (size, states)).astype(np.float32)
+    stray = random.normal(-1, 1, size).astype(np.float32)
+    gap = np.concatenate(([0], random.integers(0, 2 * hmm.MAX_GAP, size - 1))).astype(np.int32)
+    tables = hmm.transitions(states).astype(np.float64)
+    total = {}
+    for first in range(states):
+        for choice in product([*range(states), None], repeat=size):
+            state, weight = first, 1 / states
+            for t, pick in enumerate(choice):
+                if pick is None:
+                    weight *= hmm.STRAY * np.exp(stray[t])
+                    continue
+                move = (1.0 if pick == state else 0.0) if t == 0 else tables[gap[t], state, pick]
+                weight *= move * (1 - hmm.STRAY) * np.exp(evidence[t, pick])
+                state = pick
+            total[choice, first] = weight
+    return evidence, stray, gap, total
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_forward_backward_is_the_sum_over_all_paths(seed):
+    evidence, stray, gap, total = columns_case(seed)
+    start = np.array([0, len(evidence)], np.int32)
+    posterior, lost = hmm.smooth_columns(evidence, start, gap, hmm.transitions(4), stray)
+    expected, none = np.zeros_like(evidence, np.float64), np.zeros(len(evidence))
+    for (choice, _), weight in total.items():
+        for t, pick in enumerate(choice):
+            if pick is None:
+                none[t] += weight
+            else:
+                expected[t, pick] += weight
+    everything = sum(total.values())
+    np.testing.assert_allclose(posterior, expected / everything, atol=3e-3)
+    np.testing.assert_allclose(lost, none / everything, atol=3e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_viterbi_is_the_best_of_all_paths(seed):
+    evidence, stray, gap, total = columns_case(seed)
+    start = np.array([0, len(evidence)], np.int32)
+    path = hmm.best_paths(evidence, start, gap, hmm.transitions(4), stray)
+    best = max(total, key=lambda key: total[key])[0]
+    assert [None if s < 0 else int(s) for s in path] == list(best)
+
+
+def chain_of(count):
+    return linking.Chains(
+        np.arange(count, dtype=np.int32), np.array([0, count], np.int32), np.arange(count, dtype=np.int32)
+    )
+
+
+def test_votes_are_the_weighted_mean_of_the_neighbours():
+    logs = np.random.default_rng(2).normal(size=(9, 3)).astype(np.float32)
+    votes = linking.votes_along(logs, chain_of(9), 2.0, 1.5)
+    weight = np.exp(-np.abs(np.arange(9)[:, None] - np.arange(9)[None, :]) / 2.0)
+    np.fill_diagonal(weight, 0)
+    expected = 1.5 * weight @ logs / np.maximum(weight.sum(axis=1), 1)[:, None]
+    np.testing.assert_allclose(votes, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_the_path_along_a_chain_pays_for_a_change():
+    logs = np.zeros((10, 2), np.float32)
+    logs[:5, 0] = logs[5:, 1] = 2
+    logs[2] = 0, 1
+    assert list(linking.path_along(logs, chain_of(10), 6.0)) == [0] * 5 + [1] * 5
+    assert set(linking.path_along(logs, chain_of(10), 100.0)) == {1}
+
+
+@pytest.mark.parametrize("length", [400, 40])
+def test_amplitudes_and_magnification_of_made_signals(length):
+    scale, drift, count = 1.41, 0.04, 24
+    column = np.tile(np.arange(length // 4, dtype=np.int32), count)
+    number = np.repeat(np.arange(count), length // 4)
+    start = (np.arange(count + 1) * (length // 4)).astype(np.int32)
+    chains = linking.Chains(np.arange(len(column), dtype=np.int32), start, column)
+    y = np.float32(20 + 40 * number)
+    peaks = stripes.Peaks(np.zeros(2, np.int32), y, *(y * 0 + 1,) * 4, np.ones(len(y), np.uint8))
+    shape = (40 * count, length)
+    own = scale * np.exp(drift * (y * 2 / shape[0] - 1))
+    x = np.arange(length)
+    light = np.empty((count, length), np.float32)
+    for n in range(count):
+        ratio = OWN.ratio[2 * (n % 16)] * (0.9, 0.8, 0.7, 0.6)
+        phase = 2 * np.pi * OWN.carriers[:, None] * x / own[number == n][0] + n
+        light[n] = 50 * (1 + 0.1 * x / length + (ratio[:, None] * np.cos(phase)).sum(axis=0))
+    flat = light.ravel()
+    size = magnification.window_px(OWN, scale)
+    if length >= 2 * size:
+        signals = carriers.Signals(flat, np.zeros(len(y), np.float32))
+        search = carriers.search_carriers(signals, peaks, chains, OWN, 1.38, shape)
+        assert min(search.contrast) > 1.5
+        field = magnification.fit_field(flat, peaks, chains, OWN, search, size, shape) * search.scale
+        np.testing.assert_allclose(field, own, rtol=0.006)
+    seen = emissions.measure(flat, chains, np.float32(own / scale), OWN, scale, size)
+    expected = OWN.ratio[2 * (number % 16)] * (0.9, 0.8, 0.7, 0.6)
+    assert np.abs(seen.ratio - expected).max() < 0.03
+    assert np.median(seen.sigma) < 0.02
+
+
+def test_dense_rows_keep_a_quadratic_and_stop_at_a_missing_stripe():
+    columns, size, pitch, step = 6, 300, 40.0, 27.0
+    stripe = np.array([0, 1, 2, 4, 5], np.int32)
+    y = np.float32(30 + 40 * stripe + 0.8 * stripe**2)
+    row = np.float32((stripe + 0.5) * step - 0.5)
+    ones = np.ones(5 * columns, np.float32)
+    knots = dense.Knots(
+        np.arange(0, 5 * columns + 1, 5, dtype=np.int32),
+        np.tile(y, columns),
+        np.tile(row, columns),
+        0.1 * ones,
+        ones,
+        90 * ones,
+        80 * ones,
+        np.tile(stripe, columns),
+    )
+    maps = dense.interpolate(knots, (size, 4 * columns), pitch, step)
+    assert np.isnan(maps.rows[150:165]).all()
+    assert (maps.confidence[150:165] == 0).all()
+    inner = slice(int(y[0]), int(y[2]))
+    at = (-40 + np.sqrt(1600 + 3.2 * (np.arange(size) - 30.0).clip(0))) / 1.6
+    np.testing.assert_allclose(maps.rows[inner, 8], ((at + 0.5) * step - 0.5)[inner], atol=0.05)
+    np.testing.assert_allclose(maps.albedo[inner], 90, rtol=1e-5)
+    assert np.ptp(maps.rows[inner], axis=1).max() < 1e-3
