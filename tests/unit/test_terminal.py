@@ -1,0 +1,78 @@
+"""What is drawn on a terminal, and what stands there instead in a log; that no kernel waits for the first scan."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from service.terminal import print_error, print_facts, print_json, print_table, progress_lines
+from service.warm_up import modules_with_kernels
+
+ROOT = Path(__file__).parents[2]
+COLOURS = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("TERM", "xterm")
+    for stream in (sys.stdout, sys.stderr):
+        monkeypatch.setattr(stream, "isatty", lambda: True)
+
+
+def test_a_log_gets_plain_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_lines() as lines:
+        lines.stage("capturing", 3)
+        lines.stage("capturing", 3)
+        lines.advance(2, 3, "2 of 3 frames")
+        lines.note("a frame was taken again")
+        lines.stage("decoding")
+    assert capsys.readouterr().err.splitlines() == [
+        "a frame was taken again",
+        "capturing (2 of 3 frames)",
+        "decoding",
+    ]
+    assert list(lines.spent) == ["capturing", "decoding"]
+    print_table("t", ("kind", "name"), [("camera", 1), ("x", "")])
+    print_facts("f", [("points", 12), ("a", "b")])
+    assert capsys.readouterr().out == "kind    name\ncamera  1\nx\npoints  12\na       b\n"
+    print_error("bad", "mend it")
+    assert capsys.readouterr().err == "error: bad\nhint: mend it\n"
+
+
+@pytest.mark.usefixtures("terminal")
+def test_a_terminal_gets_bars_and_tables(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_lines() as lines:
+        lines.stage("capturing", 3)
+        lines.advance(2, 3, "2 of 3 frames")
+        lines.note("[red]no markup")
+        lines.stage("decoding")
+    drawn = COLOURS.sub("", capsys.readouterr().err)
+    assert "capturing" in drawn
+    assert "2 of 3 frames" in drawn
+    assert "[red]no markup" in drawn
+    print_table("devices", ("kind", "name"), [("camera", "[0]")])
+    print_facts("scan", [("points", "[bold]12")])
+    drawn = COLOURS.sub("", capsys.readouterr().out)
+    assert "│ camera │ [0]" in drawn
+    assert "[bold]12" in drawn
+
+
+def test_json_holds_no_word_that_json_does_not_know(capsys: pytest.CaptureFixture[str]) -> None:
+    print_json({"a": [float("nan"), float("inf"), 1.5], "p": Path("x"), 3: None})
+    assert json.loads(capsys.readouterr().out) == {"a": [None, None, 1.5], "p": "x", "3": None}
+
+
+def test_every_kernel_is_compiled_at_set_up() -> None:
+    """A module with kernels is named by a module of its own folder that set-up warms up, or offers that itself."""
+    warmed = {name.replace(".", "/") for name in modules_with_kernels()}
+    sources = {path: path.read_text() for package in ("scanner", "drivers") for path in (ROOT / package).rglob("*.py")}
+    for path, text in sources.items():
+        if not re.search(r"^@(parallel_)?kernel", text, flags=re.MULTILINE):
+            continue
+        place = str(path.relative_to(ROOT).with_suffix(""))
+        near = [p for p in sources if p.parent == path.parent and path.stem in sources[p]]
+        names = {str(p.relative_to(ROOT).with_suffix("")).removesuffix("/__init__") for p in near}
+        assert place in warmed or names & warmed, f"{place} has kernels that set-up does not compile"
