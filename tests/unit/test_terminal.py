@@ -14,14 +14,6 @@ ROOT = Path(__file__).parents[2]
 COLOURS = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
-@pytest.fixture
-def terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setenv("TERM", "xterm")
-    for stream in (sys.stdout, sys.stderr):
-        monkeypatch.setattr(stream, "isatty", lambda: True)
-
-
 def test_a_log_gets_plain_lines(capsys: pytest.CaptureFixture[str]) -> None:
     with progress_lines() as lines:
         lines.stage("capturing", 3)
@@ -42,8 +34,11 @@ def test_a_log_gets_plain_lines(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == "error: bad\nhint: mend it\n"
 
 
-@pytest.mark.usefixtures("terminal")
-def test_a_terminal_gets_bars_and_tables(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_terminal_gets_bars_and_tables(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     with progress_lines() as lines:
         lines.stage("capturing", 3)
         lines.advance(2, 3, "2 of 3 frames")
