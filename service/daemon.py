@@ -111,7 +111,7 @@ class Daemon:
         router = bound(context, zmq.ROUTER, self._endpoints.worker)
         rig = self._config.model_dump(mode="json")
         devices = DevicesLink(rig, self.publish, inherit=[lock], silence_s=self._devices_silence_s)
-        command_line = ("--lifeline", "--connect", self._endpoints.control)
+        command_line = ("--serve", self._endpoints.worker)
         workers = WorkerPool(router, self.publish, command_line, inherit=[lock], silence_s=self._worker_silence_s)
         pipeline = Pipeline(store, spool, devices, workers, self.publish)
         control = Control(
@@ -165,8 +165,7 @@ class Daemon:
         self._reply(address, data)
 
     def _reply(self, address: list[bytes], data: bytes) -> None:
-        # Pieces of files go without another copy: libzmq holds the bytes until they are sent.
-        if not send_now(self._control, [*address, data], copy=len(data) < 1 << 16):
+        if not send_now(self._control, [*address, data]):
             _log.info("a client went away before its answer came")
 
     async def _drain_subscriptions(self) -> None:

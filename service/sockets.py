@@ -59,10 +59,10 @@ def refuse_taken(endpoint: str) -> None:
         )
 
 
-def send_now(to: zmq.asyncio.Socket, parts: Sequence[bytes], *, copy: bool = True) -> bool:
+def send_now(to: zmq.asyncio.Socket, parts: Sequence[bytes]) -> bool:
     """Send without waiting; False where the peer's queue is full or the peer is gone."""
     # With DONTWAIT the future is done when it is returned.
-    sent = cast("asyncio.Future[None]", to.send_multipart(parts, zmq.DONTWAIT, copy=copy))
+    sent = cast("asyncio.Future[None]", to.send_multipart(parts, zmq.DONTWAIT))
     error = sent.exception()
     if error is None:
         return True

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from scanner.errors import DecodeError, ScannerError
 from scanner.storage import prepare_output
-from scanner.stream import Ack, DecodedNote, End, Failed, Frame, FromWorker, Progress, Released, Result, Start
+from scanner.stream import Ack, Cancel, DecodedNote, End, Failed, Frame, FromWorker, Progress, Released, Result, Start
 from scanner.wire import FileEntry, error_body
 from service.spool import CAPTURE
 from service.warm_up import modules_with_kernels
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 ACK_EVERY = 4
 """Frames between two acknowledgements: a sixteenth of the credit."""
 
-Job = Start | Frame | End
+Job = Start | Frame | End | Cancel
 _log = logging.getLogger(__name__)
 
 
@@ -86,7 +86,13 @@ class Work:
         self._answer(Failed(delivery, error_body(error)))
 
     def _do(self, message: Job) -> None:
-        if isinstance(message, Start):
+        if isinstance(message, Cancel):
+            # Whatever has become of it: it was stopped in a stage and answered so, is answered for, or never began.
+            self._cancelled.discard(message.delivery)
+            if self._series is None or self._series.delivery == message.delivery:
+                raise _Cancelled
+        elif isinstance(message, Start):
+            self._check(message.delivery)
             self._series = _Series(message, self._answer, self._check, decode=self._decode)
             self._series.begin()
         elif self._series is not None and self._series.delivery == message.delivery:
@@ -100,7 +106,6 @@ class Work:
 
     def _check(self, delivery: int) -> None:
         if delivery in self._cancelled or self._ending.is_set():
-            self._cancelled.discard(delivery)
             raise _Cancelled
 
 

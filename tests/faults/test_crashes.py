@@ -1,0 +1,294 @@
+"""Killed workers, daemons and devices processes: what is left is decoded, or failed with its reason."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from scanner.client import AsyncClient, Client
+from scanner.errors import DecodeError, DeviceLost, Unreachable
+from service.config import load_rig
+from service.daemon import Daemon
+
+RIG = "simulated:quick/board"
+
+
+class RunningDaemon:
+    """A daemon process on a state folder that outlives it."""
+
+    def __init__(self, state: Path, workers: int = 1) -> None:
+        rig = load_rig(RIG)
+        rig = rig.model_copy(update={"daemon": rig.daemon.model_copy(update={"workers": workers})})
+        state.mkdir(exist_ok=True)
+        (state / "rig.toml").write_text(rig.as_toml())
+        self.endpoint = f"ipc://{state}/control.ipc"
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "service.daemon", "--config", state / "rig.toml", "--private", state, "--lifeline"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == b"ready\n"
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.end()
+
+    def end(self) -> None:
+        for pipe in (self.process.stdin, self.process.stdout):
+            assert pipe is not None
+            pipe.close()
+        self.process.wait(10)
+
+
+@pytest.fixture
+def daemon(tmp_path: Path) -> Iterator[Callable[..., RunningDaemon]]:
+    running: list[RunningDaemon] = []
+
+    def start(**options: Any) -> RunningDaemon:
+        running.append(RunningDaemon(tmp_path / "state", **options))
+        return running[-1]
+
+    yield start
+    for each in running:
+        each.end()
+    wait_for(lambda: not any(children(each.process.pid) for each in running))
+
+
+def children(daemon_pid: int, module: str = "") -> list[int]:
+    """Processes that a daemon started, of one module or all."""
+    found = []
+    for folder in Path("/proc").iterdir():
+        with suppress(OSError, ValueError, IndexError):
+            command = (folder / "cmdline").read_bytes()
+            stat = (folder / "stat").read_text().rpartition(")")[2].split()
+            if module.encode() in command and int(stat[1]) == daemon_pid and stat[0] != "Z":
+                found.append(int(folder.name))
+    return found
+
+
+def wait_for(true: Callable[[], Any], timeout_s: float = 10.0) -> Any:
+    deadline = time.monotonic() + timeout_s
+    while not (found := true()):
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.02)
+    return found
+
+
+def wait_for_event(client: Client, job: str, kind: str) -> None:
+    for event in client.events(job):
+        if event.kind == kind:
+            return
+    raise AssertionError(f"{job} ended without {kind}: {client.result(job)}")
+
+
+# --- workers ------------------------------------------------------------------------------------------------------
+
+
+def test_a_worker_killed_in_mid_scan_is_replaced(daemon: Callable[..., RunningDaemon]) -> None:
+    running = daemon()
+    with Client(running.endpoint) as client:
+        job = client.start_scan("pmp")
+        (seat,) = wait_for(lambda: [w for w in client.status()["workers"] if w["job"] == job])
+        os.kill(seat["pid"], signal.SIGKILL)
+        assert client.wait(job)["state"] == "done"
+        assert client.status()["workers"][0]["pid"] != seat["pid"]
+
+
+def test_a_capture_that_kills_its_worker_three_times_is_given_up_and_named(
+    daemon: Callable[..., RunningDaemon],
+) -> None:
+    running = daemon()
+    killed: set[int] = set()
+    with Client(running.endpoint) as client:
+        job = client.start_scan("pmp")
+        deadline = time.monotonic() + 30
+        while (status := client.call("scan.status", id=job))["state"] not in ("failed", "done"):
+            assert time.monotonic() < deadline
+            for worker in client.status()["workers"]:
+                if worker["job"] == job and worker["pid"] not in killed:
+                    killed.add(worker["pid"])
+                    os.kill(worker["pid"], signal.SIGKILL)
+            time.sleep(0.01)
+        assert (status["reason"], len(killed)) == ("worker_lost", 3)
+        assert job in status["error"]["message"]
+        assert "fringed decode" in status["error"]["data"]["hint"]
+        with pytest.raises(DecodeError, match=job):
+            client.fetch(job, Path("never"))
+        assert client.scan("mcp").xyz is not None
+
+
+# --- daemons ------------------------------------------------------------------------------------------------------
+
+
+def test_daemon_killed_while_it_acquires(daemon: Callable[..., RunningDaemon], tmp_path: Path) -> None:
+    first, job_id = daemon(), str(uuid.uuid4())
+    with Client(first.endpoint) as client:
+        client.start_scan("pmp", job_id=job_id)
+        wait_for_event(client, job_id, "frame")
+        first.kill()
+    second = daemon()
+    with Client(second.endpoint) as client:
+        assert client.start_scan("pmp", job_id=job_id) == job_id
+        outcome = client.wait(job_id)
+        assert (outcome["state"], outcome["reason"]) == ("failed", "daemon_restarted")
+        assert outcome["error"]["message"]
+        assert "open" not in (tmp_path / "state" / "spool" / job_id / "capture" / "capture.json").read_text()
+        assert client.scan("mcp").xyz is not None
+
+
+def test_daemon_killed_between_scan_and_decode(daemon: Callable[..., RunningDaemon]) -> None:
+    first, job_id = daemon(workers=0), str(uuid.uuid4())
+    with Client(first.endpoint) as client:
+        client.start_scan("mcp", job_id=job_id)
+        wait_for_event(client, job_id, "acquired")
+        first.kill()
+    second = daemon()
+    with Client(second.endpoint) as client:
+        assert client.start_scan("mcp", job_id=job_id) == job_id
+        outcome = client.wait(job_id)
+        assert (outcome["state"], outcome["reason"]) == ("done", "completed")
+        assert len(client.list_scans()) == 1
+
+
+def test_daemon_killed_with_a_scan_in_the_queue(daemon: Callable[..., RunningDaemon]) -> None:
+    first = daemon()
+    with Client(first.endpoint) as client:
+        client.start_scan("pmp")
+        waiting = client.start_scan("mcp")
+        first.kill()
+    second = daemon()
+    with Client(second.endpoint) as client:
+        outcome = client.wait(waiting)
+        assert (outcome["state"], outcome["reason"]) == ("failed", "daemon_restarted")
+        assert "queued" in outcome["error"]["message"]
+
+
+def test_a_client_lives_through_a_restart(daemon: Callable[..., RunningDaemon]) -> None:
+    first = daemon(workers=0)
+    with Client(first.endpoint) as client:
+        job = client.start_scan("mcp")
+        wait_for_event(client, job, "acquired")
+        first.kill()
+        daemon()
+        assert client.wait(job)["state"] == "done"
+
+
+def test_nothing_lives_on_after_a_killed_daemon(daemon: Callable[..., RunningDaemon]) -> None:
+    running = daemon()
+    with Client(running.endpoint) as client:
+        client.start_scan("pmp")
+        started = wait_for(lambda: (pids := children(running.process.pid)) and len(pids) == 2 and pids)
+    running.kill()
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in started))
+    with pytest.raises(Unreachable, match="nobody listens"):
+        Client(running.endpoint)
+
+
+def test_two_daemons_on_one_state_are_refused(daemon: Callable[..., RunningDaemon], tmp_path: Path) -> None:
+    daemon(workers=0)
+    second = subprocess.run(
+        [sys.executable, "-m", "service.daemon", "--config", RIG, "--private", tmp_path / "state"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=20,
+    )
+    assert second.returncode == 1
+    assert "another daemon" in second.stderr
+
+
+def test_sigterm_ends_a_daemon_in_order(daemon: Callable[..., RunningDaemon], tmp_path: Path) -> None:
+    running = daemon()
+    with Client(running.endpoint) as client:
+        job = client.start_scan("pmp")
+        wait_for_event(client, job, "frame")
+        running.process.terminate()
+        assert running.process.wait(10) == 0
+    assert not list((tmp_path / "state").glob("*.ipc"))
+    assert '"cancelled"' in (tmp_path / "state" / "jobs" / f"{job}.json").read_text()
+
+
+# --- devices ------------------------------------------------------------------------------------------------------
+
+
+@asynccontextmanager
+async def daemon_here(state: Path, **options: Any) -> AsyncIterator[tuple[AsyncClient, Callable[[], int]]]:
+    """A daemon in this event loop, its children real; gives a client and the devices process' id."""
+    endpoint = f"ipc://{state}/control.ipc"
+    rig = load_rig(RIG)
+    served = Daemon(rig, state_dir=state, endpoint=endpoint, **options)
+    ready = asyncio.Event()
+    serving = asyncio.create_task(served.run(ready))
+    await ready.wait()
+
+    def devices() -> int:
+        (pid,) = children(os.getpid(), "service.devices_process")
+        return pid
+
+    try:
+        async with AsyncClient(endpoint) as client:
+            yield client, devices
+    finally:
+        served.stop()
+        await serving
+
+
+@pytest.mark.parametrize(
+    ("blow", "says"), [(signal.SIGKILL, "devices process died"), (signal.SIGSTOP, "said nothing for 1 s")]
+)
+async def test_devices_that_die_or_hang_end_the_scan_and_come_back(
+    tmp_path: Path, blow: signal.Signals, says: str
+) -> None:
+    async with daemon_here(tmp_path, devices_silence_s=1.0) as (client, devices):
+        job = await client.start_scan("pmp")
+        async for event in client.events(job):
+            if event.kind == "frame" and event.fields["captured"] < event.fields["total"]:
+                os.kill(devices(), blow)
+                break
+        outcome = await client.wait(job)
+        assert (outcome["state"], outcome["reason"]) == ("failed", "device_lost")
+        assert says in outcome["error"]["message"]
+        with pytest.raises(DeviceLost):
+            await client.fetch(job, tmp_path / "never")
+        assert (await client.scan("mcp")).xyz is not None
+
+
+async def test_a_worker_that_hangs_is_replaced(tmp_path: Path) -> None:
+    async with daemon_here(tmp_path, worker_silence_s=2.5) as (client, _):
+        while not (workers := (await client.status())["workers"]):
+            await asyncio.sleep(0.05)
+        job = await client.start_scan("mcp")
+        os.kill(workers[0]["pid"], signal.SIGSTOP)
+        assert (await client.wait(job))["state"] == "done"
+
+
+async def test_a_damaged_spool_is_found_by_its_digests(tmp_path: Path) -> None:
+    async with daemon_here(tmp_path) as (client, _):
+        while not (workers := (await client.status())["workers"]):
+            await asyncio.sleep(0.05)
+        os.kill(workers[0]["pid"], signal.SIGSTOP)
+        job = await client.start_scan("mcp")
+        async for event in client.events(job):
+            if event.kind == "acquired":
+                frames = tmp_path / "spool" / job / "capture" / "frames.npy"
+                content = bytearray(frames.read_bytes())
+                content[5000] ^= 1
+                frames.write_bytes(content)
+                os.kill(workers[0]["pid"], signal.SIGCONT)
+        outcome = await client.result(job)
+        assert (outcome["state"], outcome["reason"]) == ("failed", "decode_failed")
+        assert "digest" in outcome["error"]["message"]
