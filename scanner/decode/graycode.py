@@ -175,7 +175,7 @@ class GrayDecoder:
         lit = (white - black > self._thresholds.min_contrast_levels) & (white < self._camera.max_value)
         if np.count_nonzero(lit) < 100:
             return 1.0
-        expected = model.variance((white + black) / 2)[lit]
+        expected = model.variance((white + black) * np.float32(0.5))[lit]
         ratios = []
         for bits in self._axes.values():
             for bit, kind in enumerate(bits.kinds(self._pattern.bits)):
@@ -205,7 +205,7 @@ class GrayDecoder:
                 frames if not bits.inverse else np.stack([bits.inverse.get(bit, blank) for bit in range(pattern.bits)])
             )
         model = default_noise(self._camera.max_value)
-        maps = _AxisMaps(*(np.empty(light.size, np.float32) for _ in range(3)), np.empty(light.size, np.uint8))
+        maps = _AxisMaps.empty(light.size)
         decode_bits(
             frames, inverses, np.array(kinds), light, dark, clipped,
             pattern.code == "gray", pattern.code_bits - pattern.bits, self._sequence.projector.along(bits.axis),
@@ -230,8 +230,8 @@ class GrayDecoder:
             sigma_rows=sigmas.get("y"),
             sigma_columns=sigmas.get("x"),
             confidence=merged.confidence.reshape(shape),
-            albedo=((light + dark) / 2).reshape(shape),
-            modulation=((light - dark) / 2).reshape(shape),
+            albedo=((light + dark) * np.float32(0.5)).reshape(shape),
+            modulation=((light - dark) * np.float32(0.5)).reshape(shape),
             reason=merged.reason.reshape(shape),
             warnings=warnings,
             details={
@@ -251,6 +251,12 @@ class _AxisMaps:
     sigma: Map
     confidence: Map
     reason: NDArray[np.uint8]
+
+    @classmethod
+    def empty(cls, pixels: int) -> _AxisMaps:
+        """Maps to be written."""
+        position, sigma, confidence = (np.empty(pixels, np.float32) for _ in range(3))
+        return cls(position, sigma, confidence, np.empty(pixels, np.uint8))
 
     def join(self, other: _AxisMaps) -> None:
         """Keep what both axes decided; this axis's confidence and reason become those of both."""

@@ -33,7 +33,7 @@ _S6 = np.float32(0.0000430638 / 8)
 
 
 @kernel
-def decode_bits(
+def decode_bits(  # noqa: PLR0915  (one pass over a tile; calls would keep loops from vectorising)
     frames: NDArray[Any],
     inverses: NDArray[Any],
     kinds: NDArray[np.int64],

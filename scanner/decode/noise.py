@@ -15,7 +15,7 @@ ROUNDING_VARIANCE = 1 / 12
 """Variance of rounding to whole grey levels; no frame is better."""
 
 DEFAULT_FULL_WELL_E = 10_000
-"""Electrons at the top of the range of a small-pixel industrial camera, for captures that show no noise of their own."""
+"""Electrons at the top of the range of an industrial camera: for captures that show no noise of their own."""
 
 DEFAULT_READ_SHARE = 0.004
 """Its read noise as a share of the range (1 grey level of 8 bits)."""
@@ -50,7 +50,7 @@ def fit_noise(level: NDArray[np.float32], squares: NDArray[np.float32], freedom:
         freedom: degrees of freedom of each sum. max_value: largest grey level of the camera.
 
     Medians in bins of equal count stand against pixels that moved or are mixed; the median of a chi-square variable of
-    k degrees is k (1 - 2 / (9 k))^3 (Wilson and Hilferty 1931). Fewer than 100 samples, or no freedom, give the default.
+    k degrees is k (1 - 2 / (9 k))^3 (Wilson and Hilferty 1931). Under 100 samples, or no freedom, give the default.
     """
     if freedom < 1 or level.size < 100:
         return default_noise(max_value)

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Map, Reason
+from scanner.decode.agreement import Remainder, agreement
 from scanner.decode.frames import FrameCheck
 from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel, fit_noise
 from scanner.decode.pmp_kernels import fit_set, unwrap
-from scanner.decode.pmp_witness import Remainder, SetWitness, agreement, check_agreement, check_sets, set_witness
 from scanner.decode.unwrapping import Ladder, plan_ladder
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern
@@ -66,12 +66,15 @@ class _Set:
 
     fringe_set: FringeSet
     positions: tuple[int, ...]
-    frames: NDArray[Any] | None = None
     have: list[int] = field(default_factory=list)
+    """shifts whose frames have arrived, in order of arrival"""
     gain: float = 0.0
-    freedom: int = 0
-    witness: SetWitness | None = None
-    done: bool = False
+    """variance of (B cos, B sin) over that of one sample"""
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of the fit's residual."""
+        return len(self.have) - 3
 
     def missing(self) -> list[int]:
         """Positions that have not arrived."""
@@ -104,6 +107,7 @@ class PmpDecoder:
         self._sets = [_Set(s, fringes[s.first : s.first + s.shifts]) for s in self._pattern.sets()]
         self._where = {p: (k, n) for k, s in enumerate(self._sets) for n, p in enumerate(s.positions)}
         self._check = FrameCheck(sequence, camera)
+        self._frames: dict[int, NDArray[Any]] = {}
         self._spare: list[NDArray[Any]] = []
         pixels = camera.width * camera.height
         per_axis = len(self._pattern.frequencies)
@@ -130,9 +134,9 @@ class PmpDecoder:
             return
         index, n = self._where[position]
         fringe_set = self._sets[index]
-        if fringe_set.frames is None:
-            fringe_set.frames = self._buffer(fringe_set.fringe_set.shifts)
-        fringe_set.frames[len(fringe_set.have)] = frame.reshape(-1)
+        if index not in self._frames:
+            self._frames[index] = self._buffer(fringe_set.fringe_set.shifts)
+        self._frames[index][len(fringe_set.have)] = frame.reshape(-1)
         fringe_set.have.append(n)
         if len(fringe_set.have) == fringe_set.fringe_set.shifts:
             self._fit(index)
@@ -142,10 +146,8 @@ class PmpDecoder:
 
         Raises:
             DecodeError: fewer than three frames of a set arrived; they are named.
-            SyncError: the frames contradict one another over the whole image; they are named.
         """
         warnings = self._complete_sets()
-        check_sets([s.witness for s in self._sets if s.witness is not None])
         self._mean /= len(self._sets)
         noise = self._noise()
         remainders: dict[Axis, list[Remainder]] = {}
@@ -166,9 +168,7 @@ class PmpDecoder:
         return np.empty((shifts, self._camera.width * self._camera.height), self._camera.dtype)
 
     def _fit(self, index: int) -> None:
-        s = self._sets[index]
-        assert s.frames is not None  # noqa: S101  (a set is fitted once, when it has frames)
-        count = len(s.have)
+        s, frames = self._sets[index], self._frames.pop(index)
         design = design_matrix(self._pattern, s.fringe_set.shifts, s.have)
         inverse = np.linalg.inv(design.T @ design)
         weights = np.ascontiguousarray(inverse @ design.T, dtype=np.float32)
@@ -176,17 +176,11 @@ class PmpDecoder:
         phase, modulation = self._phases[axis][k], self._modulations[axis][k]
         clip = max(int(np.ceil(self._thresholds.saturation * self._camera.max_value)), 1)
         fit_set(
-            s.frames[:count], weights, (design.T @ design).astype(np.float32), clip,
+            frames[: len(s.have)], weights, (design.T @ design).astype(np.float32), clip,
             phase, modulation, self._mean, self._residual, self._clipped,
         )  # fmt: skip
         s.gain = float(inverse[1, 1] + inverse[2, 2]) / 2
-        s.freedom = count - 3
-        sample = slice(self._stride // 2, None, self._stride)
-        s.witness = set_witness(
-            s.fringe_set, [s.positions[n] for n in s.have], s.frames[:count, sample], design, self._clipped[sample] != 0
-        )
-        self._spare.append(s.frames)
-        s.frames, s.done = None, True
+        self._spare.append(frames)
 
     def _complete_sets(self) -> tuple[str, ...]:
         short = [s for s in self._sets if len(s.have) < 3]
@@ -197,14 +191,14 @@ class PmpDecoder:
                 hint="capture these frames again",
             )
         warnings = []
-        for index, s in enumerate(self._sets):
-            if not s.done:
-                frames = s.missing()
-                warnings.append(
-                    f"frequency {s.fringe_set.frequency:g} along {s.fringe_set.axis} decoded from {len(s.have)} of "
-                    f"{s.fringe_set.shifts} frames; missing: {', '.join(map(str, frames))}"
-                )
-                self._fit(index)
+        for index in sorted(self._frames):
+            s = self._sets[index]
+            frames = s.missing()
+            warnings.append(
+                f"frequency {s.fringe_set.frequency:g} along {s.fringe_set.axis} decoded from {len(s.have)} of "
+                f"{s.fringe_set.shifts} frames; missing: {', '.join(map(str, frames))}"
+            )
+            self._fit(index)
         return tuple(warnings)
 
     # --- the whole scan -----------------------------------------------------------------------------------------
@@ -253,7 +247,7 @@ class PmpDecoder:
         good = (b2 > least2).all(axis=0) & (b2 > self._thresholds.min_modulation_sigmas**2 * noise_b2).all(axis=0)
         good &= self._clipped[sample] == 0
         cycles2 = noise_b2[:, good] / (b2[:, good] * 4 * np.pi**2)
-        remainders = agreement(
+        return agreement(
             ladder,
             self._phases[axis][:, sample][:, good],
             cycles2,
@@ -261,13 +255,6 @@ class PmpDecoder:
             self._thresholds.phase_floor_cycles,
             noise.measured,
         )
-        check_agreement(
-            ladder, remainders, [s.fringe_set for s in self._sets if s.fringe_set.axis == axis], self._sets_frames(axis)
-        )
-        return remainders
-
-    def _sets_frames(self, axis: Axis) -> list[tuple[int, ...]]:
-        return [s.positions for s in self._sets if s.fringe_set.axis == axis]
 
     def _centre(self, axis: Axis) -> float:
         """The field's centre as a fraction of it, where the pattern's phase is counted from `origin` before pixel 0."""
@@ -286,8 +273,8 @@ class PmpDecoder:
             f32(self._gains(axis)), f32(ladder.combinations), f32(ladder.ratios),
             f32(errors2 * scales[:, None] ** 2), f32(errors2.sum(axis=1) * systematic**2),
             f32([noise.read, noise.per_level, ROUNDING_VARIANCE, PRIOR_FREEDOM, 1 / (PRIOR_FREEDOM + freedom)]),
-            f32([along, self._pattern.origin, ladder.frequencies[0], ladder.frequencies[0] * centre,
-                 ladder.frequencies[-1], centre - 0.5, factor]),
+            f32([along, self._pattern.origin, ladder.frequencies[0] * centre, ladder.frequencies[-1], centre - 0.5,
+                 factor]),
             f32([self._least_modulation(), t.min_modulation_sigmas**2, t.max_residual_sigmas**2,
                  t.max_residual_share**2, t.max_remainder_sigmas**2, 1 - t.min_unwrap_probability, t.edge_sigmas]),
             ladder.periodic, self._finest,
@@ -342,7 +329,6 @@ class PmpDecoder:
             "counts": {r.name.lower(): int(counts[r]) for r in Reason if counts[r]},
             "thresholds": asdict(self._thresholds),
             "noise": asdict(noise),
-            "sets": [s.witness.describe() for s in self._sets if s.witness is not None],
             "unwrapping": {
                 axis: {
                     "frequencies": [float(f) for f in ladder.frequencies],

@@ -155,7 +155,7 @@ def _add_two(
         p[i] += wp * d + vp * e
         q[i] += wq * d + vq * e
         squares[i] += d * d + e * e
-        top[i] = max(top[i], max(row[i], other[i]))
+        top[i] = max(top[i], row[i], other[i])
 
 
 @kernel
@@ -183,7 +183,7 @@ def _wrong_order(remainder: np.float32, variance: np.float32) -> np.float32:
 
 
 @kernel
-def unwrap(
+def unwrap(  # noqa: PLR0912, PLR0915  (one pass over a tile; calls would keep loops from vectorising)
     phases: NDArray[np.float32],
     modulations: NDArray[np.float32],
     mean: NDArray[np.float32],
@@ -214,8 +214,8 @@ def unwrap(
             multiplied by how much noisier the remainders of this scan are than its noise model.
         floors: (J - 1,) float32, variance of the remainder that no averaging removes.
         noise: [variance at A = 0, variance per grey level, least variance, prior's weight, 1 / (weight + freedom)].
-        scale: [pixels along the axis, origin, coarsest rung's frequency and its phase at the field's centre, finest
-            frequency, first pixel's edge as a fraction of the field, factor of sigma].
+        scale: [pixels along the axis, origin, coarsest rung's phase at the field's centre, finest frequency, first
+            pixel's edge as a fraction of the field, factor of sigma].
         limits: [modulation, modulation over its noise squared, residual variance over noise variance, residual
             variance over B^2, remainder over its sigma squared, wrong-order probability, edge in sigmas].
         finest: index of the finest set.
@@ -224,9 +224,7 @@ def unwrap(
     sets, pixels = phases.shape
     steps = ratios.size
     v0, slope, least, prior, shrink = noise[0], noise[1], noise[2], noise[3], noise[4]
-    along, origin, coarse, centre, fine, low, factor = (
-        scale[0], scale[1], scale[2], scale[3], scale[4], scale[5], scale[6],
-    )  # fmt: skip
+    along, origin, centre, fine, low, factor = scale[0], scale[1], scale[2], scale[3], scale[4], scale[5]
     min_b2, min_snr2, max_excess, max_share, max_remainder, max_wrong, edge = (
         limits[0] * limits[0], limits[1], limits[2], limits[3], limits[4], limits[5], limits[6],
     )  # fmt: skip

@@ -48,7 +48,7 @@ class Ladder:
     def warnings(self) -> tuple[str, ...]:
         """What a user should know about steps too wide for comfort."""
         return tuple(
-            f"frequency {high:g} is unwrapped by {low:g}: steps above {WIDE_STEP:g} to 1 cost coverage where it is noisy"
+            f"frequency {high:g} is unwrapped by {low:g}: steps above {WIDE_STEP:g} to 1 cost coverage in noise"
             for low, high in zip(self.frequencies[:-1], self.frequencies[1:], strict=True)
             if high / low > WIDE_STEP * (1 + _TOLERANCE)
         )
