@@ -215,4 +215,3 @@ def load_truth(folder: Path) -> Truth:
         ) from error
     except (OSError, ValueError, KeyError) as error:
         raise DecodeError(f"cannot read {path}: {error}") from error
-
