@@ -18,6 +18,13 @@ MIN_PIXELS = 150
 """Lit pixels of the thumbnail, fewer than which prove nothing."""
 
 
+PHASE_BINS = 24
+"""Bins of phase in which frames are compared: a tenth harmonic is still seen."""
+
+MIN_IN_BIN = 12
+"""Samples in each, so that noise can be told from disorder."""
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """One set's least-squares fit I_n = A + B cos(theta + alpha_n) over all samples."""
@@ -75,6 +82,38 @@ def bright_pixels(scene: Scene, fit: Fit, clipped: NDArray[np.bool_]) -> NDArray
     return scene.lit & ~clipped & (b > NOISE_SIGMAS * sigma) & (b > 0.25 * float(np.quantile(b, 0.99)))
 
 
-def mean_vector(fit: Fit, use: NDArray[np.bool_]) -> float:
+def mean_vector(fit: Fit, use: NDArray[np.bool_] | NDArray[np.intp]) -> float:
     """Length of the mean phase vector: 1 where the scene shows one phase only, 0 where it shows all alike."""
     return float(np.abs(np.exp(2j * np.pi * fit.cycles[use]).mean()))
+
+
+def disorder(fit: Fit, use: NDArray[np.bool_]) -> tuple[float, tuple[int, ...]] | None:
+    """What of the residual no response explains, rms over B; and the positions that hold most of it.
+
+    A projector's and camera's response bends all frames of a set alike: what frame n leaves at a pixel depends on
+    theta + alpha_n alone, and on the same function of it for all n. Frames are compared bin by bin of that phase; the
+    noise of the bins' means is taken off.
+
+    Returns:
+        None where the scene shows some phases too rarely, or too few frames leave a residual.
+    """
+    count = len(fit.positions)
+    if count < 4 or count != fit.fringe_set.shifts:
+        return None
+    design = design_matrix(fit.alpha).astype(np.float32)
+    frames, b = fit.frames[:, use], fit.modulation[use]
+    left = (frames - design @ solve(design_matrix(fit.alpha), frames)) / b
+    turns = fit.cycles[use][None, :] + (fit.alpha / (2 * np.pi)).astype(np.float32)[:, None]
+    index = ((turns % 1.0) * PHASE_BINS).astype(np.intp) % PHASE_BINS
+    members = np.stack([np.bincount(row, minlength=PHASE_BINS) for row in index])
+    if members.min() < MIN_IN_BIN:
+        return None
+    pairs = list(zip(index, left, strict=True))
+    means = np.stack([np.bincount(i, weights=row, minlength=PHASE_BINS) for i, row in pairs]) / members
+    squares = np.stack([np.bincount(i, weights=row * row, minlength=PHASE_BINS) for i, row in pairs]) / members
+    noise = ((squares - means**2) / members).mean(axis=1)
+    power = np.maximum(((means - means.mean(axis=0)) ** 2).mean(axis=1) - 2 * noise, 0)
+    value = float(np.sqrt(power.sum() / (count - 3)))
+    # Four or five frames leave one or two degrees of freedom: the residual spreads over all of them.
+    most = power > 0.5 * power.max() if count > 5 else np.full(count, True)
+    return value, tuple(p for p, guilty in zip(fit.positions, most, strict=True) if guilty)

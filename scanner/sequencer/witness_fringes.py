@@ -12,7 +12,6 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.pmp_witness import set_witness
 from scanner.patterns import PmpPattern
 from scanner.patterns.pmp import FringeSet
 from scanner.sequencer.fringe_fit import (
@@ -21,6 +20,7 @@ from scanner.sequencer.fringe_fit import (
     bright_pixels,
     clipped_pixels,
     design_matrix,
+    disorder,
     fit_set,
     mean_vector,
     solve,
@@ -59,9 +59,10 @@ def fringe_witnesses(scene: Scene, cannot: list[str]) -> list[Witness]:
     fits = [fit for fringe_set in pattern.sets() if (fit := fit_set(scene, pattern, fringe_set)) is not None]
     clipped = clipped_pixels(scene)
     items = [item for fit in fits if (item := _residual(scene, fit, fits, clipped)) is not None]
-    items += _means(scene, fits, clipped)
     items += _copies(scene, fits)
     suspected = {p for item in items if not item.passed for p in item.frames}
+    items += _means(scene, fits, clipped, suspected)
+    suspected |= {p for item in items if not item.passed for p in item.frames}
     for axis in pattern.axes:
         mine = [fit for fit in fits if fit.fringe_set.axis == axis]
         items += order_witnesses(scene, pattern, axis, mine, clipped, suspected, cannot)
@@ -91,9 +92,8 @@ def _residual(scene: Scene, fit: Fit, others: Sequence[Fit], clipped: NDArray[np
     if left > 1.5 * noise and (found := _explained(fit, others, bright, left, noise)) is not None:
         wrong, says = found
         return Witness(name, False, left, limit, wrong, f"{called}: {says}")
-    seen = set_witness(fit.fringe_set, fit.positions, fit.frames[:, bright], design, clipped[bright])
-    if seen.disorder is not None:
-        left, limit, wrong = seen.disorder, MAX_DISORDER + noise, seen.suspects
+    if (seen := disorder(fit, bright)) is not None:
+        (left, wrong), limit = seen, MAX_DISORDER + noise
     else:
         wrong = _odd_one_out(fit, bright, left) if left > limit else ()
     if left <= limit:
@@ -201,7 +201,7 @@ def _odd_one_out(fit: Fit, bright: NDArray[np.bool_], left: float) -> tuple[int,
     return (fit.positions[n],) if best < GAIN_VARIED * left else fit.positions
 
 
-def _means(scene: Scene, fits: Sequence[Fit], clipped: NDArray[np.bool_]) -> list[Witness]:
+def _means(scene: Scene, fits: Sequence[Fit], clipped: NDArray[np.bool_], suspected: set[int]) -> list[Witness]:
     """Equal mean light of all sets, pixel by pixel, and between black and white: the only check inside three shifts."""
     if not fits:
         return []
@@ -225,7 +225,8 @@ def _means(scene: Scene, fits: Sequence[Fit], clipped: NDArray[np.bool_]) -> lis
     noise = scene.noise / float(np.median(b)) * np.sqrt(own + (0.26 if references is not None else own.mean()))
     value = np.sqrt(np.maximum(value**2 - noise**2, 0))
     limit = MAX_MEAN_DIFFERENCE / (2 if references is None and len(fits) == 2 else 1) + noise
-    wrong = [fits[int(i)] for i in np.flatnonzero(value > limit)]
+    # A set with a frame that is named already has its reason.
+    wrong = [fits[int(i)] for i in np.flatnonzero(value > limit) if not suspected & set(fits[int(i)].positions)]
     frames = tuple(sorted(p for fit in wrong for p in fit.positions))
     worst = int(np.argmax(value / limit))
     if not wrong:
@@ -256,15 +257,17 @@ def _copies(scene: Scene, fits: Sequence[Fit]) -> list[Witness]:
         use = scene.lit & (fit.modulation > 4 * scene.noise)
         if np.count_nonzero(use) < MIN_PIXELS:
             continue
-        own = _varied(fit, use)
+        stride = max(1, int(np.count_nonzero(use)) // 2000)
+        chosen = np.flatnonzero(use)[::stride]
+        own = _varied(fit, chosen)
         for later in fits[f:]:
-            if later is not fit and not (own and _varied(later, use)):
+            if later is not fit and not (own and _varied(later, chosen)):
                 continue
             for i, j in _pairs(fit, later):
-                difference = sigma_between(fit.frames[i][use], later.frames[j][use])
+                difference = sigma_between(fit.frames[i][chosen], later.frames[j][chosen])
                 expected = 8 * noise
                 if later is fit:
-                    expected = sigma_between(fit.model(i)[use], fit.model(j)[use])
+                    expected = sigma_between(fit.model(i)[chosen], fit.model(j)[chosen])
                 if expected < COPY_EXPECTED * noise:
                     continue
                 nearest = min(nearest, difference / noise)
@@ -277,7 +280,7 @@ def _copies(scene: Scene, fits: Sequence[Fit]) -> list[Witness]:
     return [Witness("copies", not frames, nearest, COPY_SIGMAS, tuple(sorted(frames)), says)]
 
 
-def _varied(fit: Fit, use: NDArray[np.bool_]) -> bool:
+def _varied(fit: Fit, use: NDArray[np.intp]) -> bool:
     """Whether the scene shows enough of the set's phases for two frames not to be alike by chance."""
     return mean_vector(fit, use) < 0.9
 

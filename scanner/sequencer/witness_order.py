@@ -269,15 +269,15 @@ def _best_places(bar: NDArray[np.float64], light: NDArray[np.bool_], nearby: flo
     Returns (best agreement nearby, best elsewhere, where in words). Nearby:
     response errors of few shifts bend positions by so much. Edges, where blur decides, count little: they are few.
     """
-    stride = max(1, bar.size // 3000)
+    stride = max(1, bar.size // 1500)
     bar, light = bar[::stride], light[::stride]
+    lit = np.append(bar_light(np.arange(BAR_COUNT), BAR_COUNT) > 0.5, False)
     near, far, far_at = -1.0, -1.0, ""
     for mirrored in (False, True):
         base = BAR_COUNT - bar if mirrored else bar
         for offset in np.arange(0, BAR_COUNT, 0.25):
             moved = min(offset, BAR_COUNT - offset)
-            place = np.floor((base + offset) % BAR_COUNT)
-            agrees = float(np.mean((bar_light(place, BAR_COUNT) > 0.5) == light))
+            agrees = float(np.mean(lit[((base + offset) % BAR_COUNT).astype(np.intp)] == light))
             if not mirrored and moved <= nearby:
                 near = max(near, agrees)
             elif agrees > far:

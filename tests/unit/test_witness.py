@@ -1,0 +1,230 @@
+"""Witnesses of content: every disorder is seen, no sound capture is accused."""
+
+from __future__ import annotations
+
+import random
+from functools import cache
+
+import numpy as np
+import pytest
+
+from scanner.devices import Pixels
+from scanner.patterns import PatternSequence, PmpPattern
+from scanner.sequencer import Witnesses, witness
+from tests.unit.sequencer_bench import QUICK, Taken, gray, pmp, take
+
+SCENES = ("board", "sphere_board", "sphere_dark", "blocks", "bust", "textured", "two_albedo", "wedge")
+PATTERNS = {
+    "8 shifts": pmp((1.0, 8.0), (8, 8)),
+    "3 shifts": pmp((1.0, 16.0), (3, 3)),
+    "4 shifts": pmp((1.0, 6.0, 36.0), (4, 4, 4)),
+    "heterodyne": pmp((11.0, 12.0, 13.0), (5, 5, 5)),
+    "one set": pmp((1.0,), (16,)),
+    "unequal": pmp((1.0, 8.0, 32.0), (8, 3, 12)),
+}
+
+
+@cache
+def taken(pattern: str, scene: str = "board") -> Taken:
+    return take(PATTERNS[pattern], scene=scene, exposure_ns=16_666_667)
+
+
+def reordered(capture: Taken, order: dict[int, int]) -> dict[int, Pixels]:
+    """The thumbnails, with position p showing what was taken at order[p]."""
+    shown = capture.thumbnails
+    return {p: shown[order.get(p, p)] for p in shown}
+
+
+def questioned(capture: Taken, order: dict[int, int]) -> Witnesses:
+    return witness(capture.sequence, reordered(capture, order), capture.format.max_value)
+
+
+def sets(sequence: PatternSequence) -> list[tuple[int, ...]]:
+    pattern = sequence.pattern
+    assert isinstance(pattern, PmpPattern)
+    return [sequence.fringes[s.first : s.first + s.shifts] for s in pattern.sets()]
+
+
+# --- sound captures ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("pattern", ["4 shifts", "3 shifts"])
+def test_sound_captures_are_not_accused(scene: str, pattern: str) -> None:
+    found = questioned(taken(pattern, scene), {})
+    assert found.passed, [item for item in found.items if not item.passed]
+    assert not found.suspects
+
+
+@pytest.mark.parametrize(
+    "conditions",
+    [
+        {"exposure_ns": 4_166_667, "faults": "full_well_e=2000&read_noise_dn=2"},
+        {"faults": "ambient=0.5"},
+        {"faults": "gamma=2.0"},
+        {"faults": "gamma=2.6"},
+        {"exposure_ns": 60_000_000},
+        {"faults": "bits=12"},
+    ],
+    ids=["dark and noisy", "strong ambient", "gamma -.3", "gamma +.3", "saturated", "12 bits"],
+)
+@pytest.mark.parametrize("scene", ["sphere_dark", "bust"])
+def test_hard_conditions_are_not_disorder(scene: str, conditions: dict[str, object]) -> None:
+    for pattern in ("3 shifts", "4 shifts"):
+        capture = take(PATTERNS[pattern], scene=scene, **conditions)  # type: ignore[arg-type]
+        assert capture.acquisition.witnesses.passed, capture.acquisition.witnesses.items
+        assert capture.acquisition.retakes == 0
+
+
+@pytest.mark.parametrize("pattern", list(PATTERNS))
+def test_an_uncorrected_gamma_is_not_disorder(pattern: str) -> None:
+    bent = PATTERNS[pattern].pattern
+    sequence = PatternSequence.bracketed(QUICK, bent)
+    for scene in ("board", "sphere_dark"):
+        found = take(sequence, scene=scene).acquisition
+        assert found.witnesses.passed, found.witnesses.items
+
+
+def test_a_small_lit_object_is_not_accused_and_what_it_cannot_reveal_is_said() -> None:
+    capture = taken("8 shifts")
+    rng = np.random.default_rng(3)
+    shown = {}
+    for position, pixels in capture.thumbnails.items():
+        dark = rng.normal(3, 1, pixels.shape).clip(0).astype(np.uint8)
+        dark[50:62, 70:86] = pixels[50:62, 70:86]
+        shown[position] = dark
+    found = witness(capture.sequence, shown, 255)
+    assert found.passed, found.items
+    assert any("order bars" in text for text in found.cannot_reveal)
+
+
+def test_nothing_lit_is_said_clearly() -> None:
+    rng = np.random.default_rng(3)
+    sequence = PATTERNS["8 shifts"]
+    shown = {p: rng.normal(5, 1.5, (120, 160)).clip(0).astype(np.uint8) for p in range(len(sequence))}
+    found = witness(sequence, shown, 255)
+    assert found.dark
+    assert not found.passed
+
+
+def test_captures_from_elsewhere_are_judged_by_what_they_have() -> None:
+    capture = taken("3 shifts")
+    bare = PatternSequence(QUICK, capture.sequence.pattern)
+    shown = [capture.thumbnails[p] for p in capture.sequence.fringes]
+    found = witness(bare, dict(enumerate(shown)), 255)
+    assert found.passed
+    assert any("no sentinels" in text for text in found.cannot_reveal)
+    assert any("no order bars" in text for text in found.cannot_reveal)
+    rotated = witness(bare, dict(enumerate([*shown[:3], shown[4], shown[5], shown[3]])), 255)
+    assert not rotated.passed
+
+
+# --- disorder ----------------------------------------------------------------------------------------------------
+
+
+def disorders(sequence: PatternSequence) -> dict[str, dict[int, int]]:
+    """Everything that can happen to the order of a sequence: position -> what it shows instead."""
+    rng = random.Random(1)  # noqa: S311
+    count, groups = len(sequence), sets(sequence)
+    found: dict[str, dict[int, int]] = {"reversed": {p: count - 1 - p for p in range(count)}}
+    for lag in (1, 2, -1, len(groups[0])):
+        found[f"late by {lag}"] = {p: min(max(p - lag, 0), count - 1) for p in range(count)}
+    for number, group in enumerate(groups):
+        i = rng.randrange(len(group) - 1)
+        found[f"swap in set {number}"] = {group[i]: group[i + 1], group[i + 1]: group[i]}
+        found[f"double in set {number}"] = {group[i + 1]: group[i]}
+        found[f"set {number} rotated"] = dict(zip(group, (*group[1:], group[0]), strict=True))
+        found[f"set {number} reversed"] = dict(zip(group, group[::-1], strict=True))
+    found["all sets rotated"] = {p: q for g in groups for p, q in zip(g, (*g[1:], g[0]), strict=True)}
+    found["all sets reversed"] = {p: q for g in groups for p, q in zip(g, g[::-1], strict=True)}
+    found["fringes reversed"] = dict(zip(sequence.fringes, sequence.fringes[::-1], strict=True))
+    if len(groups) > 1:
+        found["swap across sets"] = {groups[0][1]: groups[1][2], groups[1][2]: groups[0][1]}
+        if len(groups[0]) == len(groups[1]):
+            found["second set is the first again"] = dict(zip(groups[1], groups[0], strict=True))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("pattern", "scene"),
+    [("8 shifts", "board"), ("3 shifts", "bust"), ("4 shifts", "blocks"), ("heterodyne", "board"), ("one set", "bust")],
+)
+def test_every_disorder_is_seen(pattern: str, scene: str) -> None:
+    capture = taken(pattern, scene)
+    for name, order in disorders(capture.sequence).items():
+        assert not questioned(capture, order).passed, name
+
+
+def test_swapped_and_doubled_frames_are_named() -> None:
+    capture = taken("8 shifts")
+    assert questioned(capture, {5: 6, 6: 5}).suspects == (5, 6)
+    assert questioned(capture, {6: 5}).suspects == (6,)
+    assert questioned(capture, {5: 14, 14: 5}).suspects == (5, 14)
+
+
+def test_a_rotated_set_is_named_and_the_blind_rotation_needs_the_bars() -> None:
+    capture = taken("4 shifts")
+    middle = sets(capture.sequence)[1]
+    assert set(questioned(capture, dict(zip(middle, (*middle[1:], middle[0]), strict=True))).suspects) == set(middle)
+    blind = taken("3 shifts")
+    order = disorders(blind.sequence)["all sets rotated"]
+    found = questioned(blind, order)
+    assert [item.name for item in found.items if not item.passed] == ["order bars y"]
+    assert found.whole
+
+
+def test_sentinels_tell_blends_lag_and_direction() -> None:
+    capture = taken("8 shifts")
+    order = disorders(capture.sequence)
+    assert "backwards" in questioned(capture, order["reversed"]).items[0].says
+    assert "before its own" in questioned(capture, order["late by 1"]).items[0].says
+    assert "after its own" in questioned(capture, order["late by -1"]).items[0].says
+    shown = capture.thumbnails
+    blended = {p: np.rint(0.8 * shown[p].astype(float) + 0.2 * shown[max(p - 1, 0)]).astype(np.uint8) for p in shown}
+    found = witness(capture.sequence, blended, 255)
+    assert "neither black nor white" in found.items[0].says
+    assert found.whole
+
+
+def test_one_stale_sentinel_is_taken_again_alone() -> None:
+    found = questioned(taken("8 shifts"), {1: 0})
+    assert found.suspects == (1,)
+    assert not found.whole
+
+
+def test_a_missing_frame_does_not_accuse_the_others() -> None:
+    capture = taken("8 shifts")
+    for absent in (0, 7, 19, 22):
+        shown = {p: pixels for p, pixels in capture.thumbnails.items() if p != absent}
+        assert witness(capture.sequence, shown, 255).passed
+
+
+# --- Gray code ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("inverse", [True, False])
+@pytest.mark.parametrize("scene", ["bust", "blocks"])
+def test_gray_code_sound_and_exchanged(scene: str, inverse: bool) -> None:
+    capture = take(gray(inverse=inverse), scene=scene)
+    assert capture.acquisition.witnesses.passed, capture.acquisition.witnesses.items
+    step = 2 if inverse else 1
+    fringes = capture.sequence.fringes
+    a, b = fringes[2 * step], fringes[3 * step]
+    order = {a: b, b: a} | ({a + 1: b + 1, b + 1: a + 1} if inverse else {})
+    found = questioned(capture, order)
+    assert not found.passed
+    assert {a, b} <= set(found.suspects)
+
+
+def test_gray_pairs_that_are_no_inverses_are_named() -> None:
+    capture = take(gray())
+    a = capture.sequence.fringes[4]
+    assert set(questioned(capture, {a + 1: a}).suspects) == {a, a + 1}
+
+
+def test_white_and_black_exchanged() -> None:
+    capture = take(gray(inverse=False))
+    assert capture.sequence.white is not None
+    assert capture.sequence.black is not None
+    white, black = capture.sequence.white, capture.sequence.black
+    assert not questioned(capture, {white: black, black: white}).passed
