@@ -36,6 +36,9 @@ degrees to the camera drifts by .1 over 20 degrees of view) and along them."""
 TILES_Y, TILES_X = 6, 2
 """Tiles of the search. Narrow across the stripes, where the drift is."""
 
+ENOUGH_PIECES = 16
+"""Long pieces of stripe that suffice for the search: half a pattern's worth."""
+
 LOG_STEP = 0.004
 """Steps of the magnification: a quarter of a bin at the highest carrier."""
 
@@ -159,7 +162,7 @@ def search_carriers(
         logs.append(_contrasts(np.sqrt(power[inside].mean(axis=0)), scales, model))
         weights.append(np.sqrt(inside.sum()))
         at.append((x[inside].mean(), y[inside].mean()))
-    return _align(np.stack(logs), np.asarray(weights), np.asarray(at), scales)
+    return _align(np.stack(logs), np.asarray(weights), np.asarray(at), scales, around)
 
 
 def _contrasts(spectrum: NDArray[np.float64], scales: NDArray[np.float64], model: PatternModel) -> NDArray[np.float64]:
@@ -177,12 +180,19 @@ def _contrasts(spectrum: NDArray[np.float64], scales: NDArray[np.float64], model
 
 
 def _align(
-    logs: NDArray[np.float64], weights: NDArray[np.float64], at: NDArray[np.float64], scales: NDArray[np.float64]
+    logs: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    at: NDArray[np.float64],
+    scales: NDArray[np.float64],
+    around: float,
 ) -> CarrierSearch:
     """The magnification and drifts at which the tiles' contrasts (T, Q, N) agree best."""
-    score = logs.clip(-1, 1.5).sum(axis=2) + 0.5 * logs.min(axis=2)
+    # One line of texture must not stand for a set of carriers: none counts for more than a factor of three.
+    score = logs.clip(-1, np.log(3)).sum(axis=2) + 0.5 * logs.min(axis=2)
     score = score * weights[:, None]
     index = np.arange(len(scales))[None, :]
+    # Short chains resolve little: between like scores the one nearest to what the pitch says.
+    doubt = 4 * weights.sum() * np.log(scales / around) ** 2
     best = (-np.inf, 0, 0.0, 0.0)
     rows = np.arange(len(at))[:, None]
     for drift_y in DRIFT_Y:
@@ -190,7 +200,7 @@ def _align(
             shift = np.rint((at[:, 0] * drift_x + at[:, 1] * drift_y) / LOG_STEP).astype(int)[:, None]
             # Without need no drift: a hundredth of the score for each tenth.
             total = score[rows, np.clip(index + shift, 0, len(scales) - 1)].sum(axis=0)
-            total = total - 0.1 * (abs(drift_x) + abs(drift_y)) * np.abs(total)
+            total = total - doubt - 0.1 * (abs(drift_x) + abs(drift_y)) * np.abs(total)
             q = int(np.argmax(total))
             if total[q] > best[0]:
                 best = (float(total[q]), q, float(drift_x), float(drift_y))
@@ -210,15 +220,22 @@ def _spectra(light: Array, chains: Chains, size: int) -> tuple[NDArray[np.float6
     for first, last in zip(chains.start[:-1] * STEP, chains.start[1:] * STEP, strict=True):
         if last - first >= size:
             starts.extend(range(first, last - size + 1, size // 2))
-        elif last - first >= size // 3:
+        elif last - first >= size // 6:
             starts.append(first)
         lengths.extend([min(last - first, size)] * (len(starts) - len(lengths)))
-    thin = max(1, len(starts) // 384)  # enough for a mean in each tile
-    begin, length = np.asarray(starts, np.int64)[::thin], np.asarray(lengths, np.int64)[::thin]
+    begin, length = np.asarray(starts, np.int64), np.asarray(lengths, np.int64)
+    # Short pieces resolve little and are often texture: they count where there are hardly any others.
+    long = length >= size // 3
+    if long.sum() >= ENOUGH_PIECES:
+        begin, length = begin[long], length[long]
+    thin = max(1, len(begin) // 384)  # enough for a mean in each tile
+    begin, length = begin[::thin], length[::thin]
     sample = np.arange(size)
     present = sample[None, :] < length[:, None]
     block = np.where(present, light[np.minimum(begin[:, None] + sample[None, :], len(light) - 1)], np.float32(0))
-    weight = present * window
+    # Pieces of short chains get a sine window of their own length: a Hann window would blur what little they resolve.
+    own = np.sin(np.pi * (sample[None, :] + 0.5) / length[:, None]).astype(np.float32) * present
+    weight = np.where(length[:, None] == size, window[None, :], own)
     mean = (block * weight).sum(axis=1, keepdims=True) / np.maximum(weight.sum(axis=1, keepdims=True), 1e-6)
     block = (block - mean) * weight
     # Dark pieces weigh by their own spread, or a valley's noise outweighs stripes.

@@ -46,6 +46,12 @@ SWITCH_COST = 6.0
 MIN_CONTRAST = 1.25
 """Least ratio of a carrier's amplitude to what lies between the carriers, in the mean over the channels."""
 
+PLAIN_CONTRAST = 1.8
+"""Contrast at which no other pitch is tried: noise and texture alone stay below 1.3."""
+
+PITCHES_TRIED = 3
+"""Candidates for the pitch: the stripes', and two that texture may offer."""
+
 MIN_PITCH_MATCH = 0.35
 """Least correlation of the image's and the pattern's spectrum along the phase direction."""
 
@@ -90,6 +96,7 @@ def decode_image(
         if again.agreement.holds:
             decoded = _upside_down(_maps(turned, found, again, model, clock))
     if decoded is None:
+        _refuse_turned(upright, model, camera)
         a = decided.agreement
         raise DecodeError(
             "stripes and carriers are there, but the codes contradict the description "
@@ -203,6 +210,7 @@ class _Found:
     noise: float = 0.0
     pitch: float = 0.0
     match: float = 0.0
+    contrast: float = 0.0
     peaks: stripes.Peaks | None = None
     chains: linking.Chains | None = None
     signals: carriers.Signals | None = None
@@ -221,7 +229,19 @@ def _locate(image: Image, model: PatternModel, camera: CameraFormat, clock: _Sta
         found.hint = "check that the projector shows the pattern, its focus, and the exposure"
         return found
     with clock.stage("pitch"):
-        found.pitch, found.match = stripes.estimate_pitch(found.reduced, model)
+        candidates = stripes.estimate_pitch(found.reduced, model, PITCHES_TRIED)
+    best: _Found | None = None
+    for pitch, match in candidates:
+        trial = _search(replace(found, pitch=pitch, match=match), image, model, camera, clock)
+        if trial.contrast >= PLAIN_CONTRAST:
+            return trial
+        if best is None or trial.contrast > best.contrast:
+            best = trial
+    return best or found
+
+
+def _search(found: _Found, image: Image, model: PatternModel, camera: CameraFormat, clock: _Stages) -> _Found:
+    """Stripes and carriers at one candidate's pitch."""
     if found.pitch < stripes.MIN_PITCH_PX:
         found.fault = f"stripes are {found.pitch:.1f} px apart, too fine for this camera"
         found.hint = "project fewer bits, or move the camera closer"
@@ -243,9 +263,9 @@ def _locate(image: Image, model: PatternModel, camera: CameraFormat, clock: _Sta
         found.search = carriers.search_carriers(
             found.signals, found.peaks, found.chains, model, around, (image.shape[0], image.shape[1])
         )
-    contrast = np.asarray(found.search.contrast)
-    if np.exp(np.log(np.maximum(contrast, 0.1)).mean()) < MIN_CONTRAST:
-        shown = ", ".join(f"{c:.2f}" for c in contrast)
+    found.contrast = float(np.exp(np.log(np.maximum(found.search.contrast, 0.1)).mean()))
+    if found.contrast < MIN_CONTRAST:
+        shown = ", ".join(f"{c:.2f}" for c in found.search.contrast)
         found.fault = f"stripes {found.pitch:.1f} px apart, but not the carriers described (contrasts {shown})"
         found.hint = "check bits and carriers of the description, and focus"
     return found
@@ -254,13 +274,19 @@ def _locate(image: Image, model: PatternModel, camera: CameraFormat, clock: _Sta
 def _explain(found: _Found, image: Image, model: PatternModel, camera: CameraFormat) -> None:
     """Raise what `_locate` found wrong; a pattern turned by 90 degrees is named."""
     if found.pitch > 0:
-        other = _locate(np.ascontiguousarray(image.T), model, camera, _Stages())
-        if other.fault is None:
-            raise DecodeError(
-                "the pattern is turned by 90 degrees: its stripes run the other way",
-                hint='the other "axis" in the description, or turn projector or camera',
-            )
+        _refuse_turned(image, model, camera)
     raise DecodeError(str(found.fault), hint=found.hint)
+
+
+def _refuse_turned(image: Image, model: PatternModel, camera: CameraFormat) -> None:
+    """Raise DecodeError if the pattern is there, codes and all, once the image is turned."""
+    clock = _Stages()
+    found = _locate(np.ascontiguousarray(image.T), model, camera, clock)
+    if found.fault is None and _decide(found, model, clock).agreement.holds:
+        raise DecodeError(
+            "the pattern is turned by 90 degrees: its stripes run the other way",
+            hint='the other "axis" in the description, or turn projector or camera',
+        )
 
 
 # --- which stripe is it -------------------------------------------------------------------------------------------

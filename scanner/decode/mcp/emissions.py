@@ -215,7 +215,7 @@ def first_modulation(seen: Amplitudes, model: PatternModel) -> Array:
     return np.clip(result, MODULATION_FLOOR, MODULATION_TOP)
 
 
-CLEAR = 5.0
+CLEAR = 3.0
 """Logarithm of the odds between the best code word and the next above which a peak's own word counts as clear."""
 
 
@@ -240,11 +240,10 @@ class Agreement:
 
         On simulated scenes from boards to strong texture agree was .94 or more, hits .93 (.80 on the strongest); with
         another code order agree was .77 or less; with other carriers, fewer or more bits, fringes or an upside-down
-        image few clear words were left and hits were .78 or less. The limits stand between.
+        image few clear words were left and hits were .78 or less. The limits stand between. Without clear words there
+        is no telling: a wrong magnification fits them all.
         """
-        if self.clear < 0.02:
-            return self.hits >= 0.9
-        return self.agree >= 0.85 and self.hits >= 0.7
+        return self.clear >= 0.02 and self.agree >= 0.85 and self.hits >= 0.7
 
 
 def agreement(

@@ -36,6 +36,9 @@ MIN_STRIPES = 3.0
 _LOG_STEP = 0.01
 """Ratio between neighbours of the logarithmic frequency axis: a tenth of the spread that depth gives the pitch."""
 
+APART = 15
+"""Steps of that axis between candidates: nearer ones find the same stripes."""
+
 HEIGHT_FLOOR = 0.04
 """Stripes lower than this share of the 99th percentile are left out: what lies outside the object (mcp.md, sec. 3)."""
 
@@ -105,15 +108,16 @@ def noise_of(reduced: Array) -> float:
     return float(np.median(np.abs(second)) * 1.4826 / np.sqrt(6))
 
 
-def estimate_pitch(reduced: Array, model: PatternModel) -> tuple[float, float]:
-    """The stripes' mean pitch.
+def estimate_pitch(reduced: Array, model: PatternModel, count: int = 1) -> list[tuple[float, float]]:
+    """The stripes' mean pitch, and what else it could be: texture has periods too.
 
     Args:
         reduced: (B, H) float32.
         model: the pattern's tables.
+        count: candidates wanted.
 
     Returns:
-        pitch in image px, and the correlation (0..1) of image and pattern spectrum at it.
+        best first: pitch in image px, and the correlation (0..1) of image and pattern spectrum at it. At least one.
     """
     axis = np.arange(np.log(2.0 / reduced.shape[1]), np.log(0.5), _LOG_STEP)
     seen = _log_spectrum(reduced[:: max(1, len(reduced) // 64)], axis)
@@ -130,8 +134,15 @@ def estimate_pitch(reduced: Array, model: PatternModel) -> tuple[float, float]:
     norm = np.sqrt(energy * (own @ own)) + 1e-12
     # The share of the image's energy in the window decides between equals.
     score = product / norm * (energy / max(float(seen @ seen), 1e-12)) ** 0.25
-    best = low + int(np.argmax(score[low:high]))
-    return float(1 / np.exp(axis[best])), float(score[best])
+    left = score[low:high].copy()
+    found: list[tuple[float, float]] = []
+    for _ in range(count):
+        best = int(np.argmax(left))
+        if found and left[best] < 0.5 * found[0][1]:
+            break
+        found.append((float(1 / np.exp(axis[low + best])), float(left[best])))
+        left[max(best - APART, 0) : best + APART + 1] = -np.inf
+    return found
 
 
 def _log_spectrum(columns: Array, axis: NDArray[np.float64]) -> NDArray[np.float64]:
