@@ -4,17 +4,17 @@ The pattern is Casey's (*Enhancements to the Modified Composite Pattern Method o
 University of Kentucky 2011, sec. 2.1). The decoder follows the dissertation's chain, with each hard decision made
 soft:
 
-    stripes     pitch from the columns' spectrum; peaks and valleys in every fourth column      4.1
-    linking     peaks chained along the stripes; evidence passed along them                     (5.4 grows regions)
-    carriers    brightness along the chains; the magnification at which all carriers stand out  4.3
-    magnification  where the carriers lie at each peak: a smooth field                         (4.3 has one for all)
-    emissions   amplitude of each carrier over local brightness; likelihood of each stripe      4.4, 4.5
-    hmm         one model over both kinds of stripe: Viterbi and forward-backward               5.2, 5.3
-    subpixel    the profile averaged along the stripe, odd part fitted                          (not in the source)
-    dense       rows between the stripes; all maps                                              2.1, 3.7
+    stripes        pitch from the columns' spectrum; peaks and valleys in every fourth column      4.1
+    linking        peaks chained along the stripes; evidence passed along them                     (5.4 grows regions)
+    carriers       brightness along the chains; the magnification at which all carriers stand out  4.3
+    magnification  the same at each peak, as a smooth field                                        (4.3 has one for all)
+    emissions      amplitude of each carrier over local brightness; likelihood of each stripe      4.4, 4.5
+    hmm            one model over both kinds of stripe: Viterbi and forward-backward               5.2, 5.3
+    subpixel       the profile averaged along the stripe, its odd part fitted                      (not in the source)
+    dense          rows between the stripes; all maps                                              2.1, 3.7
 
-`decoder` puts them in order. What the dissertation's own decoder does is written down with its section numbers in
-each module; it is not this one.
+`locate` says whether the pattern is there at all; `decoder` puts the stages in order. What the dissertation's own
+decoder does is named in each module; it is not this one.
 """
 
 from __future__ import annotations

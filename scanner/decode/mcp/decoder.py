@@ -6,10 +6,8 @@ both phase directions.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import cv2
@@ -17,13 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Reason
-from scanner.decode.mcp import carriers, dense, emissions, hmm, linking, magnification, stripes, subpixel
+from scanner.decode.mcp import dense, emissions, hmm, linking, magnification, stripes, subpixel
+from scanner.decode.mcp.locate import Array, Found, Image, Stages, locate
 from scanner.decode.mcp.model import PatternModel
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
-
-Array = NDArray[np.float32]
-Image = NDArray[Any]
 
 ROUNDS = 2
 """Passes of columns and stripes over one another; a third changed no figure of the reference scenes by .001."""
@@ -42,18 +38,6 @@ MIN_CHAIN_PX = 16
 
 SWITCH_COST = 6.0
 """Natural logarithm of the odds against a change of stripe between two columns of one chain."""
-
-MIN_CONTRAST = 1.25
-"""Least ratio of a carrier's amplitude to what lies between the carriers, in the mean over the channels."""
-
-PLAIN_CONTRAST = 1.8
-"""Contrast at which no other pitch is tried: noise and texture alone stay below 1.3."""
-
-PITCHES_TRIED = 3
-"""Candidates for the pitch: the stripes', and two that texture may offer."""
-
-MIN_PITCH_MATCH = 0.35
-"""Least correlation of the image's and the pattern's spectrum along the phase direction."""
 
 
 def decode_image(
@@ -80,8 +64,8 @@ def decode_image(
     pattern.validate(projector)
     upright = _door(image, pattern, camera)
     model = PatternModel.of(pattern, projector)
-    clock = _Stages()
-    found = _locate(upright, model, camera, clock)
+    clock = Stages()
+    found = locate(upright, model, camera, clock)
     if found.fault is not None:
         _explain(found, upright, model, camera)
     decided = _decide(found, model, clock)
@@ -91,7 +75,7 @@ def decode_image(
     else:
         # The projector may hang upside down: then the stripes' order is reversed.
         turned = np.ascontiguousarray(upright[::-1])
-        found = _locate(turned, model, camera, clock)
+        found = locate(turned, model, camera, clock)
         again = _decide(found, model, clock) if found.fault is None else decided
         if again.agreement.holds:
             decoded = _upside_down(_maps(turned, found, again, model, clock))
@@ -184,95 +168,11 @@ def _door(image: NDArray[Any], pattern: McpPattern, camera: CameraFormat) -> Ima
     return np.ascontiguousarray(turned)
 
 
-class _Stages:
-    """Time of each stage, ms."""
-
-    def __init__(self) -> None:
-        self.ms: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        begin = time.perf_counter()
-        yield
-        self.ms[name] = self.ms.get(name, 0.0) + 1e3 * (time.perf_counter() - begin)
+# --- why not --------------------------------------------------------------------------------------------------------
 
 
-# --- is the pattern there, and at what size -----------------------------------------------------------------------
-
-
-@dataclass
-class _Found:
-    """What the search for stripes and carriers found; `fault` says why it is no pattern, if it is none."""
-
-    fault: str | None = None
-    hint: str | None = None
-    reduced: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    noise: float = 0.0
-    pitch: float = 0.0
-    match: float = 0.0
-    contrast: float = 0.0
-    peaks: stripes.Peaks | None = None
-    chains: linking.Chains | None = None
-    signals: carriers.Signals | None = None
-    search: carriers.CarrierSearch | None = None
-
-
-def _locate(image: Image, model: PatternModel, camera: CameraFormat, clock: _Stages) -> _Found:
-    with clock.stage("columns"):
-        found = _Found(reduced=stripes.reduce_columns(image))
-        found.noise = max(stripes.noise_of(found.reduced), 1e-3)
-    low, high = (float(v) for v in np.percentile(found.reduced[::4, ::4], (1, 99)))
-    if high - low < max(0.01 * camera.max_value, 6 * found.noise):
-        state = "black" if high < 0.1 * camera.max_value else "saturated" if low > 0.9 * camera.max_value else "uniform"
-        state = f"{state} but for noise of {found.noise:.1f}" if found.noise > 0.01 * camera.max_value else state
-        found.fault = f"no pattern: the image is {state} (grey levels {low:.0f} to {high:.0f})"
-        found.hint = "check that the projector shows the pattern, its focus, and the exposure"
-        return found
-    with clock.stage("pitch"):
-        candidates = stripes.estimate_pitch(found.reduced, model, PITCHES_TRIED)
-    best: _Found | None = None
-    for pitch, match in candidates:
-        trial = _search(replace(found, pitch=pitch, match=match), image, model, camera, clock)
-        if trial.contrast >= PLAIN_CONTRAST:
-            return trial
-        if best is None or trial.contrast > best.contrast:
-            best = trial
-    return best or found
-
-
-def _search(found: _Found, image: Image, model: PatternModel, camera: CameraFormat, clock: _Stages) -> _Found:
-    """Stripes and carriers at one candidate's pitch."""
-    if found.pitch < stripes.MIN_PITCH_PX:
-        found.fault = f"stripes are {found.pitch:.1f} px apart, too fine for this camera"
-        found.hint = "project fewer bits, or move the camera closer"
-        return found
-    if found.match < MIN_PITCH_MATCH:
-        found.fault = f"no stripes of this pattern (spectra agree to {found.match:.2f})"
-        return found
-    around = found.pitch / model.pitch
-    with clock.stage("peaks"):
-        longest = around / float(model.carriers.min())
-        found.peaks = stripes.find_peaks(found.reduced, found.pitch, longest, found.noise, model.weakest)
-    with clock.stage("chains"):
-        found.chains = linking.link(found.peaks, found.pitch)
-        found.signals = carriers.signals_along(image, found.peaks, found.chains, found.pitch, camera.max_value)
-    if len(found.peaks) == 0:
-        found.fault = "no stripes stand out of the noise"
-        return found
-    with clock.stage("carriers"):
-        found.search = carriers.search_carriers(
-            found.signals, found.peaks, found.chains, model, around, (image.shape[0], image.shape[1])
-        )
-    found.contrast = float(np.exp(np.log(np.maximum(found.search.contrast, 0.1)).mean()))
-    if found.contrast < MIN_CONTRAST:
-        shown = ", ".join(f"{c:.2f}" for c in found.search.contrast)
-        found.fault = f"stripes {found.pitch:.1f} px apart, but not the carriers described (contrasts {shown})"
-        found.hint = "check bits and carriers of the description, and focus"
-    return found
-
-
-def _explain(found: _Found, image: Image, model: PatternModel, camera: CameraFormat) -> None:
-    """Raise what `_locate` found wrong; a pattern turned by 90 degrees is named."""
+def _explain(found: Found, image: Image, model: PatternModel, camera: CameraFormat) -> None:
+    """Raise what `locate` found wrong; a pattern turned by 90 degrees is named."""
     if found.pitch > 0:
         _refuse_turned(image, model, camera)
     raise DecodeError(str(found.fault), hint=found.hint)
@@ -280,8 +180,8 @@ def _explain(found: _Found, image: Image, model: PatternModel, camera: CameraFor
 
 def _refuse_turned(image: Image, model: PatternModel, camera: CameraFormat) -> None:
     """Raise DecodeError if the pattern is there, codes and all, once the image is turned."""
-    clock = _Stages()
-    found = _locate(np.ascontiguousarray(image.T), model, camera, clock)
+    clock = Stages()
+    found = locate(np.ascontiguousarray(image.T), model, camera, clock)
     if found.fault is None and _decide(found, model, clock).agreement.holds:
         raise DecodeError(
             "the pattern is turned by 90 degrees: its stripes run the other way",
@@ -304,7 +204,7 @@ class _Decision:
     figures: dict[str, Any]
 
 
-def _decide(found: _Found, model: PatternModel, clock: _Stages) -> _Decision:
+def _decide(found: Found, model: PatternModel, clock: Stages) -> _Decision:
     peaks, chains, search, signals = found.peaks, found.chains, found.search, found.signals
     assert peaks is not None  # noqa: S101  (no fault means that the search went to its end)
     assert chains is not None  # noqa: S101
@@ -365,7 +265,7 @@ def _decide(found: _Found, model: PatternModel, clock: _Stages) -> _Decision:
 # --- maps ---------------------------------------------------------------------------------------------------------
 
 
-def _maps(image: Image, found: _Found, decided: _Decision, model: PatternModel, clock: _Stages) -> Decoded:
+def _maps(image: Image, found: Found, decided: _Decision, model: PatternModel, clock: Stages) -> Decoded:
     peaks, chains = found.peaks, found.chains
     assert peaks is not None  # noqa: S101
     assert chains is not None  # noqa: S101
@@ -439,7 +339,7 @@ def _with_maps(decoded: Decoded, change: Callable[[NDArray[Any]], NDArray[Any]],
     return replace(decoded, **changed, **more)
 
 
-def _reasons(found: _Found, decided: _Decision, rows: Array) -> NDArray[np.uint8]:
+def _reasons(found: Found, decided: _Decision, rows: Array) -> NDArray[np.uint8]:
     """Why a pixel has no row: decided per column of four pixels by the nearest peak, (H, W) uint8."""
     peaks, chains, signals = found.peaks, found.chains, found.signals
     assert peaks is not None  # noqa: S101

@@ -1,0 +1,131 @@
+"""Is the pattern there, and at what size: stripes, chains and carriers, or the reason why not.
+
+Nothing is decoded here. What is refused: images without contrast, stripes too fine, another period structure than the
+pattern's, stripes without its carriers. Whether the codes are the ones described shows only once they are decoded.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode.mcp import carriers, linking, stripes
+from scanner.decode.mcp.model import PatternModel
+from scanner.patterns import CameraFormat
+
+Array = NDArray[np.float32]
+Image = NDArray[Any]
+
+MIN_CONTRAST = 1.25
+"""Least ratio of a carrier's amplitude to what lies between the carriers, in the mean over the channels."""
+
+PLAIN_CONTRAST = 1.8
+"""Contrast at which no other pitch is tried: noise and texture alone stay below 1.3."""
+
+PITCHES_TRIED = 3
+"""Candidates for the pitch: the stripes', and two that texture may offer."""
+
+MIN_PITCH_MATCH = 0.35
+"""Least correlation of the image's and the pattern's spectrum along the phase direction."""
+
+
+class Stages:
+    """Time of each stage, ms."""
+
+    def __init__(self) -> None:
+        self.ms: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time of the block to `name`."""
+        begin = time.perf_counter()
+        yield
+        self.ms[name] = self.ms.get(name, 0.0) + 1e3 * (time.perf_counter() - begin)
+
+
+@dataclass
+class Found:
+    """What the search for stripes and carriers found; `fault` says why it is no pattern, if it is none."""
+
+    fault: str | None = None
+    hint: str | None = None
+    reduced: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    noise: float = 0.0
+    pitch: float = 0.0
+    match: float = 0.0
+    contrast: float = 0.0
+    peaks: stripes.Peaks | None = None
+    chains: linking.Chains | None = None
+    signals: carriers.Signals | None = None
+    search: carriers.CarrierSearch | None = None
+
+
+def locate(image: Image, model: PatternModel, camera: CameraFormat, clock: Stages) -> Found:
+    """Find stripes and carriers.
+
+    Args:
+        image: (H, W), stripes horizontal.
+        model: the pattern's tables.
+        camera: the frame's format.
+        clock: takes the stages' times.
+
+    Returns:
+        what was found; its `fault` says why there is no pattern, if there is none.
+    """
+    with clock.stage("columns"):
+        found = Found(reduced=stripes.reduce_columns(image))
+        found.noise = max(stripes.noise_of(found.reduced), 1e-3)
+    low, high = (float(v) for v in np.percentile(found.reduced[::4, ::4], (1, 99)))
+    if high - low < max(0.01 * camera.max_value, 6 * found.noise):
+        state = "black" if high < 0.1 * camera.max_value else "saturated" if low > 0.9 * camera.max_value else "uniform"
+        state = f"{state} but for noise of {found.noise:.1f}" if found.noise > 0.01 * camera.max_value else state
+        found.fault = f"no pattern: the image is {state} (grey levels {low:.0f} to {high:.0f})"
+        found.hint = "check that the projector shows the pattern, its focus, and the exposure"
+        return found
+    with clock.stage("pitch"):
+        candidates = stripes.estimate_pitch(found.reduced, model, PITCHES_TRIED)
+    best: Found | None = None
+    for pitch, match in candidates:
+        trial = _search(replace(found, pitch=pitch, match=match), image, model, camera, clock)
+        if trial.contrast >= PLAIN_CONTRAST:
+            return trial
+        if best is None or trial.contrast > best.contrast:
+            best = trial
+    return best or found
+
+
+def _search(found: Found, image: Image, model: PatternModel, camera: CameraFormat, clock: Stages) -> Found:
+    """Stripes and carriers at one candidate's pitch."""
+    if found.pitch < stripes.MIN_PITCH_PX:
+        found.fault = f"stripes are {found.pitch:.1f} px apart, too fine for this camera"
+        found.hint = "project fewer bits, or move the camera closer"
+        return found
+    if found.match < MIN_PITCH_MATCH:
+        found.fault = f"no stripes of this pattern (spectra agree to {found.match:.2f})"
+        return found
+    around = found.pitch / model.pitch
+    with clock.stage("peaks"):
+        longest = around / float(model.carriers.min())
+        found.peaks = stripes.find_peaks(found.reduced, found.pitch, longest, found.noise, model.weakest)
+    with clock.stage("chains"):
+        found.chains = linking.link(found.peaks, found.pitch)
+        found.signals = carriers.signals_along(image, found.peaks, found.chains, found.pitch, camera.max_value)
+    if len(found.peaks) == 0:
+        found.fault = "no stripes stand out of the noise"
+        return found
+    with clock.stage("carriers"):
+        found.search = carriers.search_carriers(
+            found.signals, found.peaks, found.chains, model, around, (image.shape[0], image.shape[1])
+        )
+    found.contrast = float(np.exp(np.log(np.maximum(found.search.contrast, 0.1)).mean()))
+    if found.contrast < MIN_CONTRAST:
+        shown = ", ".join(f"{c:.2f}" for c in found.search.contrast)
+        found.fault = f"stripes {found.pitch:.1f} px apart, but not the carriers described (contrasts {shown})"
+        found.hint = "check bits and carriers of the description, and focus"
+    return found
