@@ -1,9 +1,9 @@
 """How noisy the phases of a scan really are: how well neighbouring rungs of the ladder agree over the image.
 
-What is left of each unwrapping step, the remainder, is a phase error seen twice, whatever its cause. Its spread over a
-sample of pixels says by how much this scan's noise differs from the noise model, and what no averaging takes away
-(response, interreflection, blur). Whether frames stand in their right order is not judged here: `scanner.sequencer`
-does that, before anything is decoded.
+What is left of each unwrapping step, the remainder, would be zero everywhere but for phase errors. How much it differs
+between pixels side by side is noise, and gives a noise model to captures whose fits leave no residual (three shifts).
+What its spread has beyond that is systematic: response, interreflection, blur. Whether frames stand in their right
+order is not judged here: `scanner.sequencer` does that, before anything is decoded.
 """
 
 from __future__ import annotations
@@ -15,16 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from scanner.decode.noise import NoiseModel, default_noise, fit_noise
 from scanner.decode.unwrapping import Ladder
-
-MIN_NOISE_SCALE, MAX_NOISE_SCALE = 0.3, 4.0
-"""How far the remainders may move the noise model: a noise model measured in the same capture is not raised at all,
-because what a remainder has beyond it is systematic."""
 
 MIN_PIXELS = 400
 """Fewer usable pixels than this say nothing."""
 
+PAIR_DISTANCE = 2
+"""Camera pixels between the two of a pair: near enough to share what is systematic, too far to share a blur's noise."""
+
 _NOISE_BINS = 8
+_UNFOLDED_SIGMA = 0.15
+"""Predicted sigma of a pair's difference, cycles, up to which it stays within half a cycle (3.3 sigma)."""
+_ROUNDS = 3
+"""Of choosing such pairs by the noise model and fitting it to them; the first choice is by the default model."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +40,8 @@ class Remainder:
     """frequencies of its two rungs, cycles over the projector"""
     expected_sigma: float
     """by the noise model, cycles, median of the better half of the sample"""
-    scale: float
-    """random sigma over that of the noise model"""
     systematic: float
-    """sigma of what remains where noise is least, cycles of one set's phase: response, interreflection, blur"""
+    """sigma of what the noise model does not explain, cycles of one set's phase: response, interreflection, blur"""
     offset: float
     """circular mean, cycles"""
     agreement: float
@@ -48,19 +50,58 @@ class Remainder:
 
 
 def agreement(
-    ladder: Ladder,
-    phases: NDArray[np.float32],
-    cycles2: NDArray[np.float32],
-    centre: float,
-    floor_cycles: float,
-    measured: bool,
+    ladder: Ladder, phases: NDArray[np.float32], cycles2: NDArray[np.float32], centre: float, floor_cycles: float
 ) -> list[Remainder]:
     """How well neighbouring rungs agree, over a sample of usable pixels.
 
     Args:
         phases: (K, n) cycles. cycles2: (K, n) expected variance of each. centre: the field's centre, fraction of it.
-        floor_cycles: least systematic sigma of a set's phase. measured: the noise model is this capture's own.
+        floor_cycles: least systematic sigma of a set's phase.
     """
+    found = []
+    for j, remainder in enumerate(_remainders(ladder, phases, centre)):
+        errors2 = ladder.errors[j] ** 2
+        low, high = ladder.frequencies[j : j + 2]
+        found.append(_remainder(low, high, remainder, errors2 @ cycles2, float(errors2.sum()), floor_cycles))
+    return found
+
+
+def noise_of_pairs(
+    ladder: Ladder,
+    phases: NDArray[np.float32],
+    per_variance: NDArray[np.float32],
+    level: NDArray[np.float32],
+    centre: float,
+    max_value: int,
+) -> NoiseModel:
+    """The noise model under which remainders differ between pixels side by side as much as they do.
+
+    Args:
+        phases: (2, K, n) cycles, of pairs of usable pixels. per_variance: (2, K, n) variance of each over the variance
+            of one sample. level: (n,) mean grey level of a pair. centre: the field's centre, fraction of it.
+        max_value: largest grey level of the camera.
+
+    Returns:
+        The camera's default where there are too few pairs, or only one rung.
+    """
+    model = default_noise(max_value)
+    if len(ladder.errors) == 0:
+        return model
+    both = [np.stack(_remainders(ladder, of_one, centre)) for of_one in phases]
+    difference = both[0] - both[1]
+    difference -= np.rint(difference)
+    per_sample = (ladder.errors**2) @ (per_variance[0] + per_variance[1])
+    levels = np.broadcast_to(level, difference.shape)
+    for _ in range(_ROUNDS):
+        use = per_sample * model.variance(level) < _UNFOLDED_SIGMA**2
+        if np.count_nonzero(use) < MIN_PIXELS:
+            return model
+        squares = (difference[use] ** 2 / per_sample[use]).astype(np.float32)
+        model = fit_noise(levels[use], squares, 1, max_value)
+    return model
+
+
+def _remainders(ladder: Ladder, phases: NDArray[np.float32], centre: float) -> list[NDArray[np.float64]]:
     m, f = ladder.combinations.astype(np.float64), ladder.frequencies
     absolute = m[0] @ phases
     absolute -= np.rint(absolute - f[0] * centre)
@@ -69,9 +110,7 @@ def agreement(
         psi = m[j + 1] @ phases
         difference = f[j + 1] / f[j] * absolute - psi
         order = np.rint(difference)
-        errors2 = ladder.errors[j] ** 2
-        floor = (float(errors2.sum()), floor_cycles)
-        found.append(_remainder(f[j], f[j + 1], difference - order, errors2 @ cycles2, floor, measured))
+        found.append(difference - order)
         absolute = psi + order
     return found
 
@@ -81,37 +120,27 @@ def _remainder(
     high: float,
     remainder: NDArray[np.float64],
     variance: NDArray[np.float64],
-    floor: tuple[float, float],
-    measured: bool,
+    weight: float,
+    least: float,
 ) -> Remainder:
-    weight, least = floor
     if remainder.size < MIN_PIXELS:
-        return Remainder(float(low), float(high), 0.0, 1.0, least, 0.0, 0.0, int(remainder.size))
+        return Remainder(float(low), float(high), 0.0, least, 0.0, 0.0, int(remainder.size))
     bins = np.array_split(np.argsort(variance), _NOISE_BINS)
     x = np.array([np.median(variance[b]) for b in bins])
     y = np.array([_sigma_of_median(float(np.median(np.abs(remainder[b])))) ** 2 for b in bins])
-    scale2, rest = _line(x, y, upper=1.0 if measured else MAX_NOISE_SCALE**2)
+    # Weights 1 / y: a variance's own error grows with it.
+    rest = max(float(np.average(y - x, weights=1 / np.maximum(y, 1e-12))), 0.0)
     better = np.concatenate(bins[: _NOISE_BINS // 2])
     vector = np.exp(2j * np.pi * remainder[better]).mean()
     return Remainder(
         float(low),
         float(high),
         float(np.sqrt(np.median(variance[better]))),
-        float(np.sqrt(scale2)),
         max(float(np.sqrt(rest / weight)), least),
         float(np.angle(vector) / (2 * np.pi)),
         float(np.abs(vector)),
         int(remainder.size),
     )
-
-
-def _line(x: NDArray[np.float64], y: NDArray[np.float64], upper: float) -> tuple[float, float]:
-    # y = slope x + rest, slope within bounds, rest not negative, weights 1 / y: a variance's error grows with it.
-    w = 1 / np.maximum(y, 1e-12)
-    slope = float(np.polyfit(x, y, 1, w=w)[0]) if np.ptp(x) > 1e-3 * x.mean() else upper
-    through_zero = float(np.sum(w**2 * x * y) / np.sum(w**2 * x * x))
-    slope = float(np.clip(min(slope, through_zero), MIN_NOISE_SCALE**2, upper))
-    return slope, max(float(np.average(y - slope * x, weights=w)), 0.0)
 
 
 def _sigma_of_median(median: float) -> float:

@@ -3,12 +3,12 @@
 Frames are taken in any order. As soon as a set is whole, one pass makes its phase and modulation and the frames'
 memory serves the next set; after the last frame one pass an axis unwraps up a ladder of beats (`unwrapping`), and a
 pixel whose fringe order is not nearly certain stays undecided. How noisy the pixels are is taken from the capture
-itself: from the residual of the fit where a set has four shifts or more, and from how well neighbouring rungs agree.
+itself: from the residual of the fit where a set has four shifts or more, else from how well neighbouring rungs agree.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Map, Reason
-from scanner.decode.agreement import Remainder, agreement
+from scanner.decode.agreement import PAIR_DISTANCE, Remainder, agreement, noise_of_pairs
 from scanner.decode.frames import FrameCheck
-from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel, fit_noise
+from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel, default_noise, fit_noise
 from scanner.decode.pmp_kernels import fit_set, unwrap
 from scanner.decode.unwrapping import Ladder, plan_ladder
 from scanner.errors import DecodeError
@@ -44,8 +44,9 @@ class PmpThresholds:
     """B in grey levels: rounding makes less than one level a matter of luck"""
     min_modulation_share: float = 0.01
     """B as a share of the scan's brightest (99th percentile): light scattered from lit surfaces stays below it"""
-    min_modulation_sigmas: float = 5.0
-    """B over its own noise: noise alone passes in exp(-12.5) = 4 of a million pixels"""
+    min_modulation_sigmas: float = 7.0
+    """B over its own noise, which is also 1 over the phase's error in radians. Seven is an error of .023 cycles: no set
+    tells the fringes of one eight times as fine by that"""
     max_residual_sigmas: float = 5.0
     """rms residual over noise, and"""
     max_residual_share: float = 0.35
@@ -149,11 +150,10 @@ class PmpDecoder:
         """
         warnings = self._complete_sets()
         self._mean /= len(self._sets)
-        noise = self._noise()
+        ladders = {axis: plan_ladder(self._pattern.frequencies, self._gains(axis)) for axis in self._pattern.axes}
+        noise = self._noise(ladders)
         remainders: dict[Axis, list[Remainder]] = {}
-        ladders: dict[Axis, Ladder] = {}
-        for axis in self._pattern.axes:
-            ladder = ladders[axis] = plan_ladder(self._pattern.frequencies, self._gains(axis))
+        for axis, ladder in ladders.items():
             remainders[axis] = self._agreement(axis, ladder, noise)
             self._unwrap(axis, ladder, noise, remainders[axis])
         warnings += ladders[self._pattern.axes[0]].warnings()
@@ -215,12 +215,38 @@ class PmpDecoder:
     def _gains(self, axis: Axis) -> list[float]:
         return [s.gain for s in self._sets if s.fringe_set.axis == axis]
 
-    def _noise(self) -> NoiseModel:
+    def _noise(self, ladders: Mapping[Axis, Ladder]) -> NoiseModel:
+        if self._freedom == 0:
+            # What varies least between neighbours is noise alone: of two axes, the better one.
+            return min(
+                (self._noise_of_pairs(*item) for item in ladders.items()), key=lambda n: (not n.measured, n.read)
+            )
         sample = slice(self._stride // 2, None, self._stride)
         usable = self._clipped[sample] == 0
         return fit_noise(
             self._mean[sample][usable], self._residual[sample][usable], self._freedom, self._camera.max_value
         )
+
+    def _noise_of_pairs(self, axis: Axis, ladder: Ladder) -> NoiseModel:
+        start, end = self._stride // 2, self._mean.size - PAIR_DISTANCE
+        pair = slice(start, end, self._stride), slice(start + PAIR_DISTANCE, None, self._stride)
+        noise = default_noise(self._camera.max_value)
+        good = np.logical_and(*(self._usable(axis, sample, noise) for sample in pair))
+        gains = np.asarray(self._gains(axis), dtype=np.float32)[:, None] / np.float32(4 * np.pi**2)
+        phases = np.stack([self._phases[axis][:, sample][:, good] for sample in pair])
+        per_variance = np.stack([gains / self._modulations[axis][:, sample][:, good] ** 2 for sample in pair])
+        level = np.mean([self._mean[sample][good] for sample in pair], axis=0, dtype=np.float32)
+        return noise_of_pairs(ladder, phases, per_variance, level, self._centre(axis), self._camera.max_value)
+
+    def _usable(self, axis: Axis, sample: slice, noise: NoiseModel) -> NDArray[np.bool_]:
+        b2 = self._modulations[axis][:, sample] ** 2
+        enough = self._thresholds.min_modulation_sigmas**2 * self._noise_of_b2(axis, sample, noise)
+        good = (b2 > max(self._least_modulation() ** 2, 1e-12)) & (b2 > enough)
+        return np.asarray(good.all(axis=0) & (self._clipped[sample] == 0))
+
+    def _noise_of_b2(self, axis: Axis, sample: slice, noise: NoiseModel) -> NDArray[np.float32]:
+        gains = np.asarray(self._gains(axis), dtype=np.float32)[:, None]
+        return np.asarray(gains * self._variance(noise, sample))
 
     def _variance(self, noise: NoiseModel, pixels: slice) -> NDArray[np.float32]:
         prior = noise.variance(self._mean[pixels])
@@ -241,20 +267,11 @@ class PmpDecoder:
 
     def _agreement(self, axis: Axis, ladder: Ladder, noise: NoiseModel) -> list[Remainder]:
         sample = slice(self._stride // 2, None, self._stride)
-        b2 = self._modulations[axis][:, sample] ** 2
-        noise_b2 = np.asarray(self._gains(axis), dtype=np.float32)[:, None] * self._variance(noise, sample)
-        least2 = self._least_modulation() ** 2
-        good = (b2 > least2).all(axis=0) & (b2 > self._thresholds.min_modulation_sigmas**2 * noise_b2).all(axis=0)
-        good &= self._clipped[sample] == 0
-        cycles2 = noise_b2[:, good] / (b2[:, good] * 4 * np.pi**2)
-        return agreement(
-            ladder,
-            self._phases[axis][:, sample][:, good],
-            cycles2,
-            self._centre(axis),
-            self._thresholds.phase_floor_cycles,
-            noise.measured,
-        )
+        good = self._usable(axis, sample, noise)
+        b2 = self._modulations[axis][:, sample][:, good] ** 2
+        cycles2 = self._noise_of_b2(axis, sample, noise)[:, good] / (b2 * np.float32(4 * np.pi**2))
+        phases = self._phases[axis][:, sample][:, good]
+        return agreement(ladder, phases, cycles2, self._centre(axis), self._thresholds.phase_floor_cycles)
 
     def _centre(self, axis: Axis) -> float:
         """The field's centre as a fraction of it, where the pattern's phase is counted from `origin` before pixel 0."""
@@ -264,17 +281,14 @@ class PmpDecoder:
         t, maps, f32 = self._thresholds, self._maps[axis], partial(np.array, dtype=np.float32)
         along, centre = self._sequence.projector.along(axis), self._centre(axis)
         freedom = self._freedom
-        scales = np.array([r.scale for r in remainders], dtype=np.float64)
         systematic = np.array([r.systematic for r in remainders], dtype=np.float64)
-        factor = float(scales[-1]) if len(scales) else 1.0
         errors2 = ladder.errors**2
         unwrap(
             self._phases[axis], self._modulations[axis], self._mean, self._residual, self._clipped,
             f32(self._gains(axis)), f32(ladder.combinations), f32(ladder.ratios),
-            f32(errors2 * scales[:, None] ** 2), f32(errors2.sum(axis=1) * systematic**2),
+            f32(errors2), f32(errors2.sum(axis=1) * systematic**2),
             f32([noise.read, noise.per_level, ROUNDING_VARIANCE, PRIOR_FREEDOM, 1 / (PRIOR_FREEDOM + freedom)]),
-            f32([along, self._pattern.origin, ladder.frequencies[0] * centre, ladder.frequencies[-1], centre - 0.5,
-                 factor]),
+            f32([along, self._pattern.origin, ladder.frequencies[0] * centre, ladder.frequencies[-1], centre - 0.5]),
             f32([self._least_modulation(), t.min_modulation_sigmas**2, t.max_residual_sigmas**2,
                  t.max_residual_share**2, t.max_remainder_sigmas**2, 1 - t.min_unwrap_probability, t.edge_sigmas]),
             ladder.periodic, self._finest,
@@ -286,8 +300,8 @@ class PmpDecoder:
     def _decoded(
         self,
         noise: NoiseModel,
-        ladders: dict[Axis, Ladder],
-        remainders: dict[Axis, list[Remainder]],
+        ladders: Mapping[Axis, Ladder],
+        remainders: Mapping[Axis, list[Remainder]],
         warnings: tuple[str, ...],
     ) -> Decoded:
         axes = self._pattern.axes
@@ -320,8 +334,8 @@ class PmpDecoder:
         self,
         reason: NDArray[np.uint8],
         noise: NoiseModel,
-        ladders: dict[Axis, Ladder],
-        remainders: dict[Axis, list[Remainder]],
+        ladders: Mapping[Axis, Ladder],
+        remainders: Mapping[Axis, list[Remainder]],
     ) -> dict[str, Any]:
         counts = np.bincount(reason, minlength=len(Reason))
         return {

@@ -210,12 +210,11 @@ def unwrap(  # noqa: PLR0912, PLR0915  (one pass over a tile; calls would keep l
         phases, modulations: (K, P) float32 of the axis's sets; cycles, grey levels.
         mean: (P,) float32, A. residual: (P,) float32, sum of squared residuals of all sets. clipped: (P,) uint8.
         gains: (K,) float32, variance of (p, q) over that of one sample.
-        rungs: (J, K) float32 combinations. ratios: (J - 1,). errors: (J - 1, K): squared error weights, each
-            multiplied by how much noisier the remainders of this scan are than its noise model.
+        rungs: (J, K) float32 combinations. ratios: (J - 1,). errors: (J - 1, K): squared error weights.
         floors: (J - 1,) float32, variance of the remainder that no averaging removes.
         noise: [variance at A = 0, variance per grey level, least variance, prior's weight, 1 / (weight + freedom)].
         scale: [pixels along the axis, origin, coarsest rung's phase at the field's centre, finest frequency, first
-            pixel's edge as a fraction of the field, factor of sigma].
+            pixel's edge as a fraction of the field].
         limits: [modulation, modulation over its noise squared, residual variance over noise variance, residual
             variance over B^2, remainder over its sigma squared, wrong-order probability, edge in sigmas].
         finest: index of the finest set.
@@ -224,7 +223,7 @@ def unwrap(  # noqa: PLR0912, PLR0915  (one pass over a tile; calls would keep l
     sets, pixels = phases.shape
     steps = ratios.size
     v0, slope, least, prior, shrink = noise[0], noise[1], noise[2], noise[3], noise[4]
-    along, origin, centre, fine, low, factor = scale[0], scale[1], scale[2], scale[3], scale[4], scale[5]
+    along, origin, centre, fine, low = scale[0], scale[1], scale[2], scale[3], scale[4]
     min_b2, min_snr2, max_excess, max_share, max_remainder, max_wrong, edge = (
         limits[0] * limits[0], limits[1], limits[2], limits[3], limits[4], limits[5], limits[6],
     )  # fmt: skip
@@ -297,7 +296,7 @@ def unwrap(  # noqa: PLR0912, PLR0915  (one pass over a tile; calls would keep l
                 over = turns - low - _HALF
                 turns -= (over + _ROUND) - _ROUND
             value = turns * along - origin
-            deviation = factor * along / fine * np.sqrt(fine_errors[i])
+            deviation = along / fine * np.sqrt(fine_errors[i])
             margin = edge * deviation if periodic else -edge * deviation
             inside = value > margin - _HALF and value < along - _HALF - margin
             excess = tile_residual[i] / max(freedom, _F1)
