@@ -38,8 +38,8 @@ class GrayThresholds:
     """white less black over the noise of one sample"""
     decisive_share: float = 0.15
     """share of the contrast by which a bit's two levels must differ: less is the border of two cells, or blur"""
-    decisive_sigmas: float = 3.0
-    """the same difference over its noise"""
+    decisive_sigmas: float = 3.5
+    """the same difference over its noise; below it the bit is open"""
     max_open_cells: int = 3
     """cells that a pixel's open bits may span, two bits at most: 1 is the border of two cells, 3 two blurred bits"""
     min_code_probability: float = 0.999
@@ -47,17 +47,30 @@ class GrayThresholds:
 
 
 @dataclass
+class _Images:
+    """Code images of one axis, of one kind: (bits, P), taken as they arrive."""
+
+    pixels: NDArray[Any]
+    have: set[int] = field(default_factory=set)
+
+    def take(self, bit: int, frame: NDArray[Any]) -> None:
+        """Keep a copy of the image of `bit`."""
+        self.pixels[bit] = frame.reshape(-1)
+        self.have.add(bit)
+
+
+@dataclass(frozen=True)
 class _Bits:
-    """One axis: frames by bit, and what they became."""
+    """One axis: its images and their inverses."""
 
     axis: Axis
-    plain: dict[int, NDArray[Any]] = field(default_factory=dict)
-    inverse: dict[int, NDArray[Any]] = field(default_factory=dict)
+    plain: _Images
+    inverse: _Images
 
     def kinds(self, bits: int) -> list[int | None]:
         """PLAIN, INVERSE or BOTH for each bit; None where neither has come."""
         table = {(True, True): BOTH, (True, False): PLAIN, (False, True): INVERSE}
-        return [table.get((bit in self.plain, bit in self.inverse)) for bit in range(bits)]
+        return [table.get((bit in self.plain.have, bit in self.inverse.have)) for bit in range(bits)]
 
 
 class GrayDecoder:
@@ -87,7 +100,9 @@ class GrayDecoder:
         self._camera = camera
         self._thresholds = thresholds or GrayThresholds()
         self._check = FrameCheck(sequence, camera)
-        self._axes = {axis: _Bits(axis) for axis in self._pattern.axes}
+        self._axes = {
+            axis: _Bits(axis, self._images(True), self._images(self._pattern.inverse)) for axis in self._pattern.axes
+        }
         self._where = {p: i for i, p in enumerate(sequence.fringes)}
         self._levels: dict[str, NDArray[Any]] = {}
 
@@ -107,7 +122,7 @@ class GrayDecoder:
             axis, within = divmod(self._where[position], self._pattern.bits * each)
             bit, inverted = divmod(within, each)
             bits = self._axes[self._pattern.axes[axis]]
-            (bits.inverse if inverted else bits.plain)[bit] = frame.reshape(-1).copy()
+            (bits.inverse if inverted else bits.plain).take(bit, frame)
 
     def finish(self) -> Decoded:
         """The maps.
@@ -124,6 +139,10 @@ class GrayDecoder:
             first.join(other)
         return self._decoded(found, light, dark, factor, warnings)
 
+    def _images(self, projected: bool) -> _Images:
+        rows = self._pattern.bits if projected else 0
+        return _Images(np.empty((rows, self._camera.width * self._camera.height), self._camera.dtype))
+
     # --- frames -------------------------------------------------------------------------------------------------
 
     def _check_complete(self) -> tuple[str, ...]:
@@ -136,7 +155,9 @@ class GrayDecoder:
                 frames = [self._sequence.fringes[first + n] for n in range(each)]
                 if kind is None or (kind != BOTH and not have_levels):
                     lost += [
-                        p for p, images in zip(frames, (bits.plain, bits.inverse), strict=False) if bit not in images
+                        p
+                        for p, images in zip(frames, (bits.plain, bits.inverse), strict=False)
+                        if bit not in images.have
                     ]
                 elif kind != BOTH and each == 2:
                     warnings.append(f"bit {bit} along {axis} decoded from one of its two frames")
@@ -161,7 +182,7 @@ class GrayDecoder:
             light, dark = (self._levels[name].astype(np.float32) for name in ("white", "black"))
             return light, dark, np.asarray(dark >= clip, dtype=np.uint8)
         coarse = max((self._pattern.bits + 1) // 2, 1)
-        pairs = [(b.plain[bit], b.inverse[bit]) for b in self._axes.values() for bit in range(coarse)]
+        pairs = [(b.plain.pixels[bit], b.inverse.pixels[bit]) for b in self._axes.values() for bit in range(coarse)]
         light = np.mean([np.maximum(a, b) for a, b in pairs], axis=0, dtype=np.float32)
         dark = np.mean([np.minimum(a, b) for a, b in pairs], axis=0, dtype=np.float32)
         return light, dark, np.asarray(dark >= clip - 0.5, dtype=np.uint8)
@@ -180,10 +201,12 @@ class GrayDecoder:
         for bits in self._axes.values():
             for bit, kind in enumerate(bits.kinds(self._pattern.bits)):
                 if kind == BOTH:
-                    total = bits.plain[bit][::stride][lit].astype(np.float32) + bits.inverse[bit][::stride][lit]
+                    image, inverse = (i.pixels[bit, ::stride][lit] for i in (bits.plain, bits.inverse))
+                    total = image.astype(np.float32) + inverse
                     ratios.append((total - white[lit] - black[lit]) ** 2 / ((4 if self._levels else 3) * expected))
                 else:
-                    image = (bits.plain if kind == PLAIN else bits.inverse)[bit][::stride][lit].astype(np.float32)
+                    images = bits.plain if kind == PLAIN else bits.inverse
+                    image = images.pixels[bit, ::stride][lit].astype(np.float32)
                     nearer = np.minimum(np.abs(image - white[lit]), np.abs(image - black[lit]))
                     ratios.append(nearer**2 / (2 * expected))
         # The median of a chi-square variable of one degree is .455. Coarse bits have few borders of cells in them.
@@ -197,17 +220,11 @@ class GrayDecoder:
     def _decode(self, bits: _Bits, light: Map, dark: Map, clipped: NDArray[np.uint8], factor: float) -> _AxisMaps:
         pattern, t = self._pattern, self._thresholds
         kinds = [kind for kind in bits.kinds(pattern.bits) if kind is not None]
-        blank = next(iter((bits.plain or bits.inverse).values()))
-        frames = np.stack([bits.plain.get(bit, blank) for bit in range(pattern.bits)])
-        inverses = np.stack([bits.inverse[bit] for bit in range(pattern.bits)]) if set(kinds) == {BOTH} else None
-        if inverses is None:
-            inverses = (
-                frames if not bits.inverse else np.stack([bits.inverse.get(bit, blank) for bit in range(pattern.bits)])
-            )
         model = default_noise(self._camera.max_value)
         maps = _AxisMaps.empty(light.size)
         decode_bits(
-            frames, inverses, np.array(kinds), light, dark, clipped,
+            bits.plain.pixels, (bits.inverse if pattern.inverse else bits.plain).pixels, np.array(kinds),
+            light, dark, clipped,
             pattern.code == "gray", pattern.code_bits - pattern.bits, self._sequence.projector.along(bits.axis),
             np.array([model.read, model.per_level, ROUNDING_VARIANCE, factor], np.float32),
             np.array([t.min_contrast_levels, t.min_contrast_sigmas**2, t.decisive_share, t.decisive_sigmas**2,
