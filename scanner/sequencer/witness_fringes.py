@@ -31,13 +31,16 @@ from scanner.sequencer.witness_order import order_witnesses
 MAX_HARMONIC = 0.4
 """Second harmonic over B that a response may leave; uncorrected gamma 2.3 leaves .3."""
 
-MAX_DISORDER = 0.15
-"""Residual over B, beyond noise, that differs from frame to frame at the same phase, which no response does. Light
-that flickers by 10 % from frame to frame leaves .06, uncorrected gamma 2.3 on a vignetted field .06."""
+MAX_DISORDER = 0.06
+"""Residual over B, noise taken off, that differs from frame to frame at the same phase, which no response does. Light
+that flickers by 5 % from frame to frame leaves .03; two neighbours of 16 shifts exchanged leave .1."""
 
 GAIN_VARIED, GAIN_NARROW = 0.6, 0.35
 """Another order is believed when it brings the residual down to this share of what it was. In a scene that shows all
 phases no response can look like another order; where it shows few, a bent response at one phase may."""
+
+EQUALLY_WELL = 1.3
+"""Explanations whose residuals differ by less than this cannot be told apart."""
 
 COPY_SIGMAS = 1.15
 """Two frames that differ by no more than this, over the noise of full-on frames, are one picture: they are darker, so
@@ -93,7 +96,7 @@ def _residual(scene: Scene, fit: Fit, others: Sequence[Fit], clipped: NDArray[np
         wrong, says = found
         return Witness(name, False, left, limit, wrong, f"{called}: {says}")
     if (seen := disorder(fit, bright)) is not None:
-        (left, wrong), limit = seen, MAX_DISORDER + noise
+        (left, wrong), limit = seen, MAX_DISORDER + noise / 3
     else:
         wrong = _odd_one_out(fit, bright, left) if left > limit else ()
     if left <= limit:
@@ -108,9 +111,10 @@ def _explained(
     """Frames whose exchange, or whose showing another shift, explains the residual; and that in words."""
     gain = GAIN_VARIED if mean_vector(fit, bright) < 0.5 else GAIN_NARROW
     design, frames, b = design_matrix(fit.alpha), fit.frames[:, bright], fit.modulation[bright]
-    if (pair := _exchange(design, frames, b, gain * left)) is not None:
-        wrong = tuple(sorted(fit.positions[n] for n in pair))
-        return wrong, f"fits with frames {wrong[0]} and {wrong[1]} exchanged, and not as it is"
+    if pairs := _exchange(design, frames, b, gain * left):
+        wrong = tuple(sorted({fit.positions[n] for pair in pairs for n in pair}))
+        named = " or ".join(f"{fit.positions[i]} and {fit.positions[j]}" for i, j in pairs)
+        return wrong, f"fits with frames {named} exchanged, and not as it is"
     if wrong := _false_shifts(fit, bright, noise, gain):
         return wrong, f"frames {', '.join(map(str, wrong))} show another shift than their own"
     foreign = [(p, frame[bright]) for other in others if other is not fit for p, frame in _each(other)]
@@ -174,8 +178,11 @@ def _rms(design: NDArray[np.float64], frames: Array, b: Array) -> float:
     return float(np.sqrt(np.median((left**2).sum(axis=0)) / max(len(frames) - 3, 1)))
 
 
-def _exchange(design: NDArray[np.float64], frames: Array, b: Array, below: float) -> tuple[int, int] | None:
-    """The exchange of two frames that leaves the smallest residual, if that is below `below`."""
+def _exchange(design: NDArray[np.float64], frames: Array, b: Array, below: float) -> list[tuple[int, int]]:
+    """The exchanges of two frames that leave the smallest residual, if that is below `below`.
+
+    Of four frames, exchanging the middle two or the outer two leaves the same: one is the other, reversed.
+    """
     stride = max(1, frames.shape[1] // 2000)
     sample, weights = frames[:, ::stride], b[::stride]
     found = []
@@ -184,7 +191,7 @@ def _exchange(design: NDArray[np.float64], frames: Array, b: Array, below: float
         order[i], order[j] = order[j], order[i]
         found.append((_rms(design, sample[order], weights), (i, j)))
     found.sort()
-    return found[0][1] if found[0][0] < below else None
+    return [pair for rest, pair in found if rest < min(below, EQUALLY_WELL * found[0][0])]
 
 
 def _odd_one_out(fit: Fit, bright: NDArray[np.bool_], left: float) -> tuple[int, ...]:

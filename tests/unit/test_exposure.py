@@ -1,0 +1,69 @@
+"""Automatic exposure: the white frame near 85 % of the range, in whole periods, with warnings where that cannot be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from drivers.registry import open_camera, open_projector
+from scanner.clock import VirtualClock
+from scanner.devices import TriggerMode
+from scanner.sequencer import ExposureChoice, auto_exposure
+from scanner.sequencer.exposure import CEILING, LONGEST_NS
+
+
+def chosen(
+    world: str = "", projector: dict[str, Any] | None = None, mode: TriggerMode = TriggerMode.SOFTWARE
+) -> ExposureChoice:
+    device = "quick/board?seed=1" + world
+    clock = VirtualClock()
+    screen = open_projector("simulated", device, projector or {}, clock)
+    camera = open_camera("simulated", device, {}, clock)
+    try:
+        return auto_exposure(screen, camera, clock, trigger_mode=mode)
+    finally:
+        camera.close()
+        screen.close()
+
+
+@pytest.mark.parametrize("mode", [TriggerMode.SOFTWARE, TriggerMode.FREE])
+def test_white_comes_near_the_target_in_whole_modulation_periods(mode: TriggerMode) -> None:
+    choice = chosen(mode=mode)
+    assert choice.exposure_ns % 4_166_667 == 0
+    assert 0.75 < choice.level <= CEILING
+    assert "modulation period" in choice.note
+    assert choice.warning is None
+
+
+def test_whole_refreshes_where_no_modulation_is_known() -> None:
+    choice = chosen(projector={"modulation": "none"})
+    assert choice.exposure_ns % 16_666_667 == 0
+    assert choice.level <= CEILING
+
+
+def test_constant_bright_light_takes_part_of_a_refresh() -> None:
+    choice = chosen("&exposure_scale=6", {"modulation": "none"})
+    assert choice.exposure_ns < 16_666_667
+    assert 0.8 < choice.level < 0.9
+
+
+def test_too_bright_for_one_period_is_a_warning_with_a_way_out() -> None:
+    choice = chosen("&exposure_scale=20")
+    assert choice.exposure_ns == 4_166_667
+    assert choice.warning is not None
+    assert "gain" in choice.warning
+    assert "close the lens" in choice.warning
+
+
+def test_too_dark_takes_the_longest_sensible_exposure_and_warns() -> None:
+    choice = chosen("&exposure_scale=0.01")
+    assert 0.9 * LONGEST_NS < choice.exposure_ns <= LONGEST_NS
+    assert choice.warning is not None
+    assert "open the lens" in choice.warning
+
+
+def test_no_light_at_all_is_said() -> None:
+    choice = chosen("&exposure_scale=0.0001&noise=false")
+    assert choice.warning is not None
+    assert "lens cap" in choice.warning

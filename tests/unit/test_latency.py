@@ -1,0 +1,65 @@
+"""Latency and settling, measured on projectors whose own are known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from drivers.registry import open_camera, open_projector
+from scanner.clock import VirtualClock
+from scanner.devices import Interval, TriggerMode
+from scanner.errors import ConfigError, SyncError
+from scanner.sequencer import measure_latency
+
+DEVICE = "quick/board?seed=1"
+
+
+def measured(
+    projector: dict[str, Any], device: str = DEVICE, mode: TriggerMode = TriggerMode.SOFTWARE
+) -> tuple[Interval, Interval, float]:
+    """(latency, settle, seconds it took)."""
+    clock = VirtualClock()
+    screen = open_projector("simulated", device, projector, clock)
+    camera = open_camera("simulated", device, {}, clock)
+    begin = clock.now_ns()
+    try:
+        latency, settle = measure_latency(screen, camera, clock, trigger_mode=mode)
+    finally:
+        camera.close()
+        screen.close()
+    return latency, settle, (clock.now_ns() - begin) / 1e9
+
+
+@pytest.mark.parametrize("mode", [TriggerMode.SOFTWARE, TriggerMode.FREE])
+@pytest.mark.parametrize(
+    ("latency_us", "settle_us"), [(4200.0, 200.0), (300.0, 200.0), (21_000.0, 3000.0), (45_000.0, 500.0)]
+)
+def test_the_interval_holds_the_true_times(latency_us: float, settle_us: float, mode: TriggerMode) -> None:
+    options = {"latency_us": latency_us, "settle_us": settle_us, "declare_latency": False}
+    latency, settle, seconds = measured(options, mode=mode)
+    # The true latency lies within 200 us of the option; light has wholly changed `settle` later.
+    assert latency.low_ns <= 1000 * (latency_us + 200)
+    # A camera that runs by itself samples each flip once in its own period of 6 ms.
+    assert latency.low_ns >= 1000 * (latency_us - (6500 if mode is TriggerMode.FREE else 1500))
+    steady = latency.high_ns + settle.high_ns
+    assert 1000 * (latency_us - 200 + settle_us) <= steady <= 1000 * (latency_us + settle_us + 5000)
+    assert seconds < 2.5
+
+
+def test_a_sweep_down_the_rows_is_part_of_settling() -> None:
+    latency, settle, _ = measured({"scan": "rows", "latency_us": 9000.0, "settle_us": 2000.0, "declare_latency": False})
+    # The camera sees nine tenths of the rows, which take a refresh to sweep.
+    assert settle.high_ns > 0.8 * 16_666_667
+    assert latency.high_ns + settle.high_ns < 9_200_000 + 16_666_667 + 6_000_000
+
+
+def test_too_little_contrast_is_refused_in_words() -> None:
+    with pytest.raises(SyncError, match="black and white differ") as error:
+        measured({}, device="quick/board?seed=1&exposure_scale=0.001&ambient=1.0")
+    assert "projector lights" in (error.value.hint or "")
+
+
+def test_a_static_projector_has_no_latency() -> None:
+    with pytest.raises(ConfigError, match="only a display"):
+        measured({"kind": "static"})
