@@ -1,0 +1,244 @@
+"""Gray and binary decoding against a plain NumPy form, on frames made from the formulas; and what it must leave out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scanner.decode import Reason, decoder_for
+from scanner.decode.graycode import GrayDecoder
+from scanner.errors import DecodeError
+from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, PmpPattern, ProjectorSize
+
+PROJECTOR = ProjectorSize(320, 240)
+CAMERA = CameraFormat(200, 150)
+
+
+def surface(camera=CAMERA):
+    """Projector columns and rows seen at each pixel: a tilted, slightly bent board that fills most of the projector."""
+    y, x = np.mgrid[: camera.height, : camera.width]
+    u, v = x / camera.width, y / camera.height
+    return 8 + 300 * u + 6 * np.sin(3 * v), 6 + 225 * v + 5 * np.sin(4 * u)
+
+
+def sequence_of(pattern, levels=True):
+    description = pattern.describe() | ({"white": 0, "black": 1} if levels else {})
+    return PatternSequence.from_description(PROJECTOR, description)
+
+
+def take(sequence, camera=CAMERA, albedo=0.8, ambient=0.03, noise=0.004, seed=0):
+    """Frames of `surface`: each pixel sees the projector pixel it falls on. Noise is of the range."""
+    rng = np.random.default_rng(seed)
+    columns, rows = surface(camera)
+    at = np.rint(rows).astype(int), np.rint(columns).astype(int)
+    for position in range(len(sequence)):
+        grey = (ambient + albedo * sequence.light(position)[at]) * camera.max_value
+        grey = grey + rng.normal(size=grey.shape) * noise * camera.max_value
+        yield position, np.rint(np.clip(grey, 0, camera.max_value)).astype(camera.dtype)
+
+
+def decode(sequence, frames, camera=CAMERA):
+    decoder = decoder_for(sequence, camera)
+    assert isinstance(decoder, GrayDecoder)
+    for position, frame in frames:
+        decoder.add(position, frame)
+    return decoder.finish()
+
+
+def plain_decode(sequence, frames, axis):
+    """Positions by thresholds alone, everywhere: bits to words to cells' centres."""
+    pattern, frames = sequence.pattern, dict(frames)
+    each, words = pattern.frames_per_bit, np.zeros(next(iter(frames.values())).shape, int)
+    first = pattern.axes.index(axis) * pattern.bits * each
+    previous = np.zeros_like(words)
+    for bit in range(pattern.bits):
+        images = [frames[sequence.fringes[first + bit * each + n]].astype(float) for n in range(each)]
+        dark = images[1] if pattern.inverse else (frames[sequence.white].astype(float) + frames[sequence.black]) / 2
+        digit = (images[0] > dark).astype(int)
+        if pattern.code == "gray":
+            digit = previous = digit ^ previous
+        words = 2 * words + digit
+    return (words + 0.5) * 2.0 ** (pattern.code_bits - pattern.bits) - 0.5
+
+
+@pytest.mark.parametrize("code", ["gray", "binary"])
+@pytest.mark.parametrize(("inverse", "levels"), [(False, True), (True, True), (True, False)])
+@pytest.mark.parametrize("axes", [("x",), ("y",), ("x", "y"), ("y", "x")])
+def test_positions_are_those_of_the_plain_form(code, inverse, levels, axes):
+    sequence = sequence_of(GrayPattern(axes, bits=7, code_bits=9, code=code, inverse=inverse), levels)
+    frames = list(take(sequence))
+    found = decode(sequence, frames)
+    assert (found.columns is not None, found.rows is not None) == ("x" in axes, "y" in axes)
+    columns, rows = surface()
+    for axis, values, sigma, truth in (
+        ("x", found.columns, found.sigma_columns, columns),
+        ("y", found.rows, found.sigma_rows, rows),
+    ):
+        if axis in axes:
+            assert values.dtype == sigma.dtype == np.float32
+            assert values.shape == CAMERA.shape
+            decided = np.isfinite(values)
+            assert decided.mean() > 0.99
+            np.testing.assert_allclose(values[decided], plain_decode(sequence, frames, axis)[decided], atol=1e-4)
+            assert np.abs(values - truth)[decided].max() <= 2 + 0.5
+            np.testing.assert_allclose(sigma[decided], 4 / np.sqrt(12), rtol=1e-6)
+    assert ((found.reason == Reason.VALUE) == np.isfinite(found.confidence * sigma_or(found))).all()
+    assert found.confidence[found.reason == 0].min() >= 0.999
+    np.testing.assert_allclose(np.median(found.albedo), (0.03 + 0.4) * 255, atol=1)
+    np.testing.assert_allclose(np.median(found.modulation), 0.4 * 255, atol=1)
+
+
+def sigma_or(found):
+    return found.sigma_columns if found.sigma_columns is not None else found.sigma_rows
+
+
+@pytest.mark.parametrize("bits", [10, 12, 16])
+def test_cameras_of_more_bits(bits):
+    camera = CameraFormat(200, 150, bits)
+    sequence = sequence_of(GrayPattern(("x",), 9, 9, inverse=False))
+    found = decode(sequence, take(sequence, camera), camera)
+    assert np.isfinite(found.columns).mean() > 0.99
+    assert np.nanmax(np.abs(found.columns - surface(camera)[0])) <= 0.5 + 1e-3
+
+
+def test_frames_may_come_in_any_order():
+    sequence = sequence_of(GrayPattern(("x", "y"), 8, 9, inverse=True))
+    frames = list(take(sequence))
+    forwards, backwards = decode(sequence, frames), decode(sequence, frames[::-1])
+    np.testing.assert_array_equal(forwards.columns, backwards.columns)
+    np.testing.assert_array_equal(forwards.confidence, backwards.confidence)
+
+
+def test_sentinels_are_taken_and_ignored():
+    pattern = GrayPattern(("y",), 8, 8, inverse=False)
+    sequence = PatternSequence.bracketed(PROJECTOR, pattern)
+    found = decode(sequence, take(sequence))
+    bare = sequence_of(pattern)
+    np.testing.assert_allclose(np.nanmedian(found.rows - decode(bare, take(bare)).rows), 0)
+    assert np.isfinite(found.rows).mean() > 0.99
+
+
+def test_the_border_of_two_cells_is_decided_and_nothing_else_is_between():
+    # Every camera pixel looks exactly between two projector pixels: one bit, whichever changes there, is grey.
+    sequence = sequence_of(GrayPattern(("x",), 8, 9, inverse=False))
+    camera = CameraFormat(300, 40)
+    at = np.broadcast_to(np.arange(300), (40, 300))
+    rng = np.random.default_rng(1)
+    frames = []
+    for position in range(len(sequence)):
+        light = sequence.light(position)[0]
+        grey = 10 + 200 * (light[at] + light[at + 1]) / 2 + rng.normal(size=at.shape)
+        frames.append((position, np.rint(np.clip(grey, 0, 255)).astype(np.uint8)))
+    found = decode(sequence, frames, camera)
+    assert np.isfinite(found.columns).mean() > 0.99
+    assert np.nanmax(np.abs(found.columns - (at + 0.5))) <= 2
+    assert np.nanmax(found.sigma_columns) > 2 / np.sqrt(12)
+
+
+def test_shadow_clipped_and_beyond_the_projector_have_their_reasons():
+    sequence = sequence_of(GrayPattern(("x",), 9, 9, inverse=True))
+    frames = []
+    for position, frame in take(sequence):
+        frame[:20] = 4
+        frame[20:40] = 255
+        frames.append((position, frame))
+    found = decode(sequence, frames)
+    assert (found.reason[:20] == Reason.SHADOW).all()
+    assert (found.reason[20:40] == Reason.CLIPPED).all()
+    assert np.isfinite(found.columns[40:]).all()
+    assert (found.confidence[:40] == 0).all()
+    # The same frames on a projector of 200 columns: the codes beyond name no pixel of it.
+    narrow = PatternSequence.from_description(ProjectorSize(200, 240), sequence.describe())
+    beyond = decode(narrow, frames)
+    assert set(np.unique(beyond.reason[40:])) == {Reason.VALUE, Reason.BORDER}
+    assert np.nanmax(beyond.columns) < 200
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+@pytest.mark.parametrize("noise", [0.02, 0.05, 0.1])
+def test_noise_leaves_pixels_out_rather_than_wrong(inverse, noise):
+    camera = CameraFormat(400, 300)
+    sequence = sequence_of(GrayPattern(("x",), 9, 9, inverse=inverse))
+    found = decode(sequence, take(sequence, camera, albedo=0.5, noise=noise, ambient=0.2), camera)
+    decided = np.isfinite(found.columns)
+    wrong = np.abs(found.columns - surface(camera)[0])[decided] > 4.5
+    assert wrong.sum() <= 2e-3 * max(decided.sum(), 1)
+    assert np.mean(wrong) <= 3 * np.mean(1 - found.confidence[decided]) + 1e-4 if decided.any() else True
+    if noise <= 0.02:
+        assert decided.mean() > 0.9
+
+
+def test_a_pixel_whose_black_and_white_are_swapped_is_not_decided():
+    sequence = sequence_of(GrayPattern(("x",), 9, 9, inverse=False))
+    frames = dict(take(sequence))
+    frames[0], frames[1] = frames[1], frames[0]
+    assert (decode(sequence, frames.items()).reason == Reason.SHADOW).all()
+
+
+def test_one_image_of_a_pair_is_enough_where_white_and_black_are_there():
+    sequence = sequence_of(GrayPattern(("x",), 9, 9, inverse=True))
+    frames = dict(take(sequence))
+    del frames[sequence.fringes[4]], frames[sequence.fringes[9]]
+    found = decode(sequence, frames.items())
+    assert len(found.warnings) == 2
+    assert np.isfinite(found.columns).mean() > 0.99
+    assert np.nanmax(np.abs(found.columns - surface()[0])) <= 0.5 + 1e-3
+
+
+@pytest.mark.parametrize(
+    ("inverse", "levels", "lost", "named"),
+    [
+        (False, True, (2,), "2"),
+        (False, True, (0, 5), "0, 5"),
+        (True, True, (2, 3), "2, 3"),
+        (True, False, (7,), "7"),
+    ],
+)
+def test_missing_frames_are_named(inverse, levels, lost, named):
+    sequence = sequence_of(GrayPattern(("y",), 8, 8, inverse=inverse), levels)
+    frames = {p: f for p, f in take(sequence) if p not in lost}
+    with pytest.raises(DecodeError, match=f"frames {named} are missing"):
+        decode(sequence, frames.items())
+
+
+def test_white_and_black_are_needed_without_inverses():
+    with pytest.raises(DecodeError, match="white and a black"):
+        decoder_for(sequence_of(GrayPattern(("x",), 9, 9, inverse=False), levels=False), CAMERA)
+
+
+def test_frames_that_cannot_belong_are_refused():
+    sequence = sequence_of(GrayPattern(("x",), 9, 9, inverse=False))
+    decoder = decoder_for(sequence, CAMERA)
+    good = np.zeros(CAMERA.shape, np.uint8)
+    decoder.add(3, good)
+    with pytest.raises(DecodeError, match="given before"):
+        decoder.add(3, good)
+    with pytest.raises(DecodeError, match="199 x 150"):
+        decoder.add(4, good[:, 1:])
+    with pytest.raises(DecodeError, match="uint16"):
+        decoder.add(4, good.astype(np.uint16))
+    with pytest.raises(DecodeError, match="does not exist"):
+        decoder.add(len(sequence), good)
+    with pytest.raises(DecodeError, match="pmp"):
+        GrayDecoder(PatternSequence(PROJECTOR, PmpPattern(("x",), (1.0,), (3,))), CAMERA)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(1, 9),
+    st.sampled_from(["gray", "binary"]),
+    st.sampled_from(["x", "y"]),
+    st.booleans(),
+    st.integers(0, 2**31),
+)
+def test_any_number_of_bits(bits, code, axis, inverse, seed):
+    sequence = sequence_of(GrayPattern((axis,), bits, 9, code, inverse))
+    camera = CameraFormat(64, 48)
+    frames = list(take(sequence, camera, seed=seed))
+    found = decode(sequence, frames, camera)
+    values = found.columns if axis == "x" else found.rows
+    decided = np.isfinite(values)
+    np.testing.assert_allclose(values[decided], plain_decode(sequence, frames, axis)[decided], atol=1e-4)
+    assert decided.mean() > 0.95
