@@ -6,10 +6,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from msgspec import to_builtins
@@ -23,16 +20,14 @@ from scanner.sequencer import Acquisition, FinishReason, Plan, acquire, auto_exp
 from scanner.storage import replace_json
 from scanner.stream import EndReason
 from scanner.wire import ScanStart, error_body
-from service.pipe import Began, Ended, Frames, Need, Report
+from service.pipe import Began, Ended, Frames, Need, Report, Taken
 from service.scan_setup import OpenRig, sequence_for
+from service.write_back import WriteBack, WriteBacks
 
 Say = Callable[[Report], None]
 
 RESULT_BYTES_PER_PIXEL = 110
 """Room asked for the scan's files: eight float maps, points and normals in scan.npz and cloud.ply, and the picture."""
-
-SYNC_EVERY_BYTES = 16 << 20
-"""Written back in passing, so that little is left to wait for at the end."""
 
 
 class Scan:
@@ -85,19 +80,8 @@ class Scan:
         results = RESULT_BYTES_PER_PIXEL * self._format.width * self._format.height
         self._say(Need(self.job, frames, frames * self._frame_bytes + results, self._plan.as_dict()))
 
-    def run(self) -> None:
-        """Take the frames. Ends with `ended`, whatever happens."""
-        try:
-            ended = self._run()
-        except ScannerError as error:
-            ended = Ended(self.job, _reason_of(error), self._lines, error=error_body(error))
-        self._say(ended)
-
-    def refused(self, error: ScannerError | None) -> Ended:
-        """The report of a scan that never began."""
-        return Ended(self.job, None, error=None if error is None else error_body(error))
-
-    def _run(self) -> Ended:
+    def run(self, write_backs: WriteBacks) -> None:
+        """Take the frames, and say `taken` when the devices are free; `ended` follows when the folder is closed."""
         calibration = self._opened.calibration
         header = CaptureHeader(
             self._sequence,
@@ -109,43 +93,61 @@ class Scan:
             extra={"exposure": self._exposure},
         )
         writer = CaptureWriter(self._folder, header, self._plan.frame_count)
-        try:
-            if calibration is not None:
-                replace_json(self._folder / "calibration.json", calibration.as_dict())
-            self._write_truth()
-            self._say(Began(self.job))
-            with _WriteBack(writer, self._frame_bytes) as syncing:
-                outcome = self._acquire(writer, syncing)
+        with write_backs.of(writer, self._frame_bytes) as disk:
+            try:
+                if calibration is not None:
+                    replace_json(self._folder / "calibration.json", calibration.as_dict())
+                self._write_truth()
+                self._say(Began(self.job))
+                outcome = self._acquire(writer, disk)
+            except ScannerError as error:
+                disk.close("failed", _reason_of(error), (), self._ended_by(error))
+                return
             state: State = "complete" if outcome.reason is FinishReason.COMPLETED else "failed"
-            writer.close(state, outcome.reason.value, witnesses=outcome.witnesses.as_list())
-        except ScannerError as error:
-            with suppress(StorageError):  # on a disk that is full the folder stays `open`: interrupted, as it is
-                writer.close("failed", _reason_of(error))
-            raise
-        finally:
-            writer.abandon()
-        problem = None if outcome.error is None else error_body(outcome.error)
-        reason: EndReason = outcome.reason.value
-        return Ended(self.job, reason, self._lines, list(outcome.missing), problem, outcome.report())
+            disk.close(state, outcome.reason.value, outcome.witnesses.as_list(), self._ended_with(outcome))
+        self._say(Taken(self.job))
 
-    def _acquire(self, writer: CaptureWriter, syncing: _WriteBack) -> Acquisition:
+    def _ended_with(self, outcome: Acquisition) -> Callable[[StorageError | None], None]:
+        def say(problem: StorageError | None) -> None:
+            error = problem or outcome.error
+            reason: EndReason = "disk_full" if problem is not None else outcome.reason.value
+            body = None if error is None else error_body(error)
+            self._say(Ended(self.job, reason, self._lines, list(outcome.missing), body, outcome.report()))
+
+        return say
+
+    def _ended_by(self, error: ScannerError) -> Callable[[StorageError | None], None]:
+        # On a disk that is full the folder cannot be closed: it stays `open`, which says that it was interrupted.
+        return lambda _: self._say(Ended(self.job, _reason_of(error), self._lines, error=error_body(error)))
+
+    def refused(self, error: ScannerError | None) -> Ended:
+        """The report of a scan that never began."""
+        return Ended(self.job, None, error=None if error is None else error_body(error))
+
+    def _acquire(self, writer: CaptureWriter, disk: WriteBack) -> Acquisition:
         def on_frame(record: FrameRecord, _offset: int | None) -> None:
             self._lines += 1
             if record.slot is not None:
                 self._retakes += record.pattern in self._seen
                 self._seen.add(record.pattern)
-                syncing.frame()
+                disk.frame()
             self._say(Frames(self.job, self._lines, len(self._seen), self._retakes))
 
-        return acquire(
-            self._opened.rig,
+        opened = self._opened
+        load, opened.loaded = opened.loaded != self._sequence, None
+        outcome = acquire(
+            opened.rig,
             self._plan,
             self._sequence,
             writer,
             self._clock,
             on_frame=on_frame,
             cancelled=self._cancelled.is_set,
+            load=load,
         )
+        if outcome.reason is not FinishReason.DEVICE_LOST:
+            opened.loaded = self._sequence
+        return outcome
 
     def _exposure_ns(self) -> int | None:
         wanted = self._params.exposure or self._opened.exposure or "auto"
@@ -156,7 +158,7 @@ class Scan:
         return round(wanted * 1000)
 
     def _auto_exposure_ns(self) -> int:
-        rig = self._opened.rig
+        rig, self._opened.loaded = self._opened.rig, None
         choice = auto_exposure(
             rig.projector,
             rig.camera,
@@ -182,54 +184,6 @@ class Scan:
             return
         truth = camera.truth()
         np.savez(self._folder / "truth.npz", rows=truth.rows, columns=truth.columns, xyz=truth.xyz, lit=truth.lit)
-
-
-class _WriteBack:
-    """Syncs a capture in passing, in a thread of its own."""
-
-    def __init__(self, writer: CaptureWriter, frame_bytes: int) -> None:
-        self._writer = writer
-        self._every = max(1, SYNC_EVERY_BYTES // frame_bytes)
-        self._frames = 0
-        self._wanted = threading.Event()
-        self._closing = False
-        self._error: StorageError | None = None
-        self._thread = threading.Thread(target=self._sync, name="write-back")
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._closing = True
-        self._wanted.set()
-        self._thread.join()
-
-    def frame(self) -> None:
-        """One more frame was written.
-
-        Raises:
-            StorageError: writing back failed.
-        """
-        if self._error is not None:
-            raise self._error
-        self._frames += 1
-        if self._frames % self._every == 0:
-            self._wanted.set()
-
-    def _sync(self) -> None:
-        while True:
-            self._wanted.wait()
-            self._wanted.clear()
-            if self._closing:
-                return
-            try:
-                self._writer.sync()
-            except StorageError as error:
-                self._error = error
-                return
 
 
 def _check_filters(params: ScanStart) -> None:

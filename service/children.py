@@ -80,7 +80,8 @@ class Child:
         if self._process.stdin is not None:
             self._process.stdin.close()
         try:
-            await asyncio.wait_for(self._process.wait(), grace_s)
+            async with asyncio.timeout(grace_s):
+                await self._process.wait()
         except TimeoutError:
             _log.warning("%s (%d) did not end within %g s and was killed", self.name, self.pid, grace_s)
             self.kill()

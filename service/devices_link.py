@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -33,6 +33,7 @@ from service.pipe import (
     OpenFailed,
     Preview,
     Report,
+    Taken,
     framed,
     read_report,
 )
@@ -74,7 +75,7 @@ class DevicesLink:
         self._child: Child | None = None
         self._reader: asyncio.Task[None] | None = None
         self._opened: asyncio.Future[Opened] | None = None
-        self._scan: asyncio.Queue[Report | None] | None = None
+        self._scans: dict[str, asyncio.Queue[Report | None]] = {}
         self._numbers = itertools.count(1)
         self._discoveries: dict[int, asyncio.Future[list[dict[str, Any]]]] = {}
         self._preview: Preview | None = None
@@ -95,7 +96,8 @@ class DevicesLink:
             self._send(Open(self._rig))
         opened = self._opened
         try:
-            return await asyncio.wait_for(asyncio.shield(opened), OPEN_S)
+            async with asyncio.timeout(OPEN_S):
+                return await asyncio.shield(opened)
         except TimeoutError:
             await self._give_up()
             raise DeviceLost(
@@ -103,18 +105,20 @@ class DevicesLink:
                 hint="unplug and plug the camera, look at the log, and try `fringed devices`",
             ) from None
 
-    async def acquire(self, job: str, folder: Path, params: ScanStart, listener: ScanListener) -> Ended:
-        """Run a scan to its end, which always comes."""
+    async def acquire(self, job: str, folder: Path, params: ScanStart, listener: ScanListener) -> Awaitable[Ended]:
+        """Run a scan until the devices are free again; returns its end, which always comes, to be awaited."""
+        self._scans[job] = asyncio.Queue()
         try:
             await self.open()
         except ScannerError as error:
-            return Ended(job, None, error=error_body(error))
-        self._scan = asyncio.Queue()
+            del self._scans[job]
+            return _at_once(Ended(job, None, error=error_body(error)))
         self._send(Acquire(job, str(folder), params))
-        try:
-            return await self._follow(job, listener)
-        finally:
-            self._scan = None
+        ended = await self._follow(job, listener)
+        if ended is not None:
+            del self._scans[job]
+            return _at_once(ended)
+        return asyncio.ensure_future(self._until_closed(job))
 
     def cancel(self, job: str) -> None:
         """Stop a scan between two frames."""
@@ -128,10 +132,12 @@ class DevicesLink:
         """
         await self.open()
         number = next(self._numbers)
-        found = self._discoveries[number] = asyncio.get_running_loop().create_future()
+        found: asyncio.Future[list[dict[str, Any]]] = asyncio.get_running_loop().create_future()
+        self._discoveries[number] = found
         self._send(Discover(number))
         try:
-            return await asyncio.wait_for(found, DISCOVER_S)
+            async with asyncio.timeout(DISCOVER_S):
+                return await found
         except TimeoutError:
             raise DeviceBusy("the devices are busy with a scan", hint="ask again when it is over") from None
         finally:
@@ -155,20 +161,15 @@ class DevicesLink:
         if self._reader is not None:
             await asyncio.gather(self._reader, return_exceptions=True)
 
-    async def _follow(self, job: str, listener: ScanListener) -> Ended:
-        lines = 0
+    async def _follow(self, job: str, listener: ScanListener) -> Ended | None:
+        """Until the devices are free; the end, if it has come by then."""
         while True:
-            try:
-                report = await asyncio.wait_for(self._reports().get(), self._silence_s)
-            except TimeoutError:
-                await self._give_up()
-                silent = f"the devices process said nothing for {self._silence_s:g} s and was killed"
-                return self._lost(job, lines, silent)
+            report = await self._next(job, self._silence_s)
             match report:
-                case None:
-                    return self._lost(job, lines, "the devices process died")
                 case Ended():
                     return report
+                case Taken():
+                    return None
                 case Need():
                     try:
                         await listener.need(report)
@@ -179,23 +180,35 @@ class DevicesLink:
                 case Began():
                     listener.began()
                 case Frames():
-                    lines = report.lines
                     listener.frames(report)
 
+    async def _next(self, job: str, patience_s: float) -> Report:
+        try:
+            async with asyncio.timeout(patience_s):
+                report = await self._scans[job].get()
+        except TimeoutError:
+            await self._give_up()
+            return self._lost(job, f"the devices process said nothing for {patience_s:g} s and was killed")
+        return self._lost(job, "the devices process died") if report is None else report
+
+    async def _until_closed(self, job: str) -> Ended:
+        """The disk may be slow; the process is given up only where it is surely stuck."""
+        try:
+            while True:
+                if isinstance(report := await self._next(job, 10 * self._silence_s), Ended):
+                    return report
+        finally:
+            del self._scans[job]
+
     async def _refused(self, job: str, error: ScannerError) -> Ended:
-        while not isinstance(await self._reports().get(), Ended | None):
+        while not isinstance(await self._next(job, self._silence_s), Ended):
             continue
         return Ended(job, None, error=error_body(error))
 
-    def _reports(self) -> asyncio.Queue[Report | None]:
-        if self._scan is None:
-            raise AssertionError("no scan runs")
-        return self._scan
-
     @staticmethod
-    def _lost(job: str, lines: int, what: str) -> Ended:
+    def _lost(job: str, what: str) -> Ended:
         error = DeviceLost(what, hint="look at the log for the cause; the next scan opens the devices again")
-        return Ended(job, "device_lost", lines, error=error_body(error))
+        return Ended(job, "device_lost", error=error_body(error))
 
     def _send(self, command: Command) -> None:
         if self._child is not None:
@@ -235,9 +248,9 @@ class DevicesLink:
             case Devices(number=number, devices=devices):
                 if (waiting := self._discoveries.get(number)) is not None and not waiting.done():
                     waiting.set_result(devices)
-            case _:
-                if self._scan is not None:
-                    self._scan.put_nowait(report)
+            case Need() | Began() | Frames() | Taken() | Ended():
+                if (scan := self._scans.get(report.job)) is not None:
+                    scan.put_nowait(report)
 
     def _gone(self, status: int) -> None:
         was_open = self.description is not None
@@ -245,14 +258,20 @@ class DevicesLink:
         self._fail_opening(DeviceError(f"the devices process ended with status {status}", hint="look at the log"))
         self._opened = None
         self._child = None
-        if self._scan is not None:
-            self._scan.put_nowait(None)
+        for scan in self._scans.values():
+            scan.put_nowait(None)
         if was_open and status != 0:
             self._publish("device.lost", None, {"status": status})
 
     def _fail_opening(self, error: ScannerError) -> None:
         if self._opened is not None and not self._opened.done():
             self._opened.set_exception(error)
+
+
+def _at_once(ended: Ended) -> asyncio.Future[Ended]:
+    future: asyncio.Future[Ended] = asyncio.get_running_loop().create_future()
+    future.set_result(ended)
+    return future
 
 
 def _seen(opened: asyncio.Future[Opened]) -> None:

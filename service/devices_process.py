@@ -42,6 +42,7 @@ from service.pipe import (
 )
 from service.preview import Previewer
 from service.scan_setup import OpenRig, open_rig
+from service.write_back import WriteBacks
 
 GRACE_S = 3.0
 """Time for the devices to be given back once the daemon is gone."""
@@ -62,6 +63,7 @@ class DevicesProcess:
         self._lock = threading.Lock()
         self._opened: OpenRig | None = None
         self._previewer: Previewer | None = None
+        self._write_backs = WriteBacks()
 
     def run(self) -> int:
         """Serve until the daemon is gone; returns the exit status."""
@@ -73,6 +75,7 @@ class DevicesProcess:
                 self._previewer.close()
             if self._opened is not None:
                 self._opened.close()
+            self._write_backs.wait()
 
     def _serve(self) -> int:
         while True:
@@ -112,8 +115,8 @@ class DevicesProcess:
     def _acquire(self, command: Acquire) -> None:
         if self._opened is None:
             raise AssertionError("the daemon opens devices first")
-        if self._previewer is not None:
-            self._previewer.rest()
+        if self._previewer is not None and self._previewer.rest():
+            self._opened.loaded = None
         scan = Scan(command.job, Path(command.folder), command.params, self._opened, self._clock, self._outbox.post)
         with self._lock:
             self._scan = scan
@@ -122,7 +125,7 @@ class DevicesProcess:
         try:
             scan.prepare()
             if self._may_go(command.job):
-                scan.run()
+                scan.run(self._write_backs)
             else:
                 self._outbox.post(Ended(command.job, "cancelled"))
         except ScannerError as error:
@@ -154,6 +157,8 @@ class DevicesProcess:
         if self._previewer is not None:
             self._previewer.close()
             self._previewer = None
+            if self._opened is not None:
+                self._opened.loaded = None
         if command.rate_hz > 0 and self._opened is not None:
             self._previewer = Previewer(self._opened.rig, self._clock, command)
 

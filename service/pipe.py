@@ -106,6 +106,12 @@ class Frames(Struct, frozen=True, tag="frames"):
     retakes: int
 
 
+class Taken(Struct, frozen=True, tag="taken"):
+    """All frames are taken and the devices are free; the disk is not done yet."""
+
+    job: str
+
+
 class Ended(Struct, frozen=True, tag="ended"):
     """The scan is over and its folder closed. `reason` is None where it never began."""
 
@@ -131,7 +137,7 @@ class DeviceFault(Struct, frozen=True, tag="fault"):
 
 
 Command = Open | Acquire | Go | CancelAcquire | Preview | Discover
-Report = Opened | OpenFailed | Need | Began | Frames | Ended | Devices | DeviceFault
+Report = Opened | OpenFailed | Need | Began | Frames | Taken | Ended | Devices | DeviceFault
 
 _commands: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)
 _reports: msgspec.msgpack.Decoder[Report] = msgspec.msgpack.Decoder(Report)

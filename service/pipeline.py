@@ -10,7 +10,7 @@ import logging
 import shutil
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -23,7 +23,7 @@ from service.devices_link import DevicesLink
 from service.jobs import Job, JobState, JobStore
 from service.pipe import Ended, Frames, Need
 from service.series import Series, capture_state, missing_patterns
-from service.spool import Spool
+from service.spool import Spool, empty_trash
 from service.worker_pool import WorkerLost, WorkerPool
 
 MAX_QUEUED = 256
@@ -125,8 +125,9 @@ class Pipeline:
         """
         if not job.state.over:
             raise Refused(f"job {job.id} is {job.state}", reason="not_over", hint="cancel it first")
-        await self._on_disk(self.spool.delete, job)
+        trash = await self._on_disk(self.spool.remove, job)
         await self._save(job)
+        await asyncio.to_thread(empty_trash, trash)
         self._publish("spool.deleted", job.id, {})
 
     # --- acquiring ----------------------------------------------------------------------------------------------
@@ -154,13 +155,15 @@ class Pipeline:
 
     async def _acquire(self, job: Job) -> None:
         job.become(JobState.ACQUIRING)
-        await self._save(job)
+        # Its record has been on disk since it was asked for; what the capture folder says goes before this state.
+        self._task(self._save(job))
         self._tell(job, "started")
-        ended = await self._devices.acquire(job.id, self.spool.capture(job.id), job.params, _Listener(self, job))
-        job.captured = max(job.captured, ended.report.get("frames", 0) - len(ended.missing))
-        await self._acquired(job, ended)
+        folder = self.spool.capture(job.id)
+        ending = await self._devices.acquire(job.id, folder, job.params, _Listener(self, job))
+        self._task(self._acquired(job, ending))  # the disk may still be busy with it when the next scan begins
 
-    async def _acquired(self, job: Job, ended: Ended) -> None:
+    async def _acquired(self, job: Job, ending: Awaitable[Ended]) -> None:
+        ended = await ending
         series = self._series.get(job.id)
         if job.state.over:
             return

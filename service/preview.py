@@ -78,11 +78,12 @@ class Previewer:
         with suppress(zmq.Again):
             self._socket.send(encode_preview(header, small.data.cast("B")), zmq.DONTWAIT)
 
-    def rest(self) -> None:
-        """Stop the camera for a scan; the next `show` starts it again."""
-        if self._running:
+    def rest(self) -> bool:
+        """Stop the camera for a scan; the next `show` starts it again. Whether it ran."""
+        ran, self._running = self._running, False
+        if ran:
             self._rig.camera.stop()
-            self._running = False
+        return ran
 
     def close(self) -> None:
         """End the preview."""

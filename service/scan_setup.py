@@ -47,6 +47,8 @@ class OpenRig:
     settings: Mapping[str, Any]
     """the rig file as plain data"""
     calibration: Calibration | None
+    loaded: PatternSequence | None = None
+    """what the projector holds; None: something else"""
 
     @property
     def projector(self) -> ProjectorSize:
@@ -71,6 +73,7 @@ class OpenRig:
         known = (rig.latency or declared.latency) is not None and (rig.settle or declared.settle) is not None
         if known or declared.kind is not ProjectorKind.FRAMEBUFFER:
             return
+        self.loaded = None
         latency, settle = measure_latency(
             rig.projector, rig.camera, clock, settings=rig.settings, trigger_mode=rig.trigger_mode
         )

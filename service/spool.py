@@ -107,20 +107,27 @@ class Spool:
         return job.state is JobState.CANCELLED or job.acknowledged or self._old(job)
 
     def delete(self, job: Job) -> None:
-        """Delete a job's files: they vanish at once, their bytes soon after.
+        """Delete a job's files.
 
         Raises:
             StorageError: the folder cannot be changed.
         """
-        folder = self.folder(job.id)
+        empty_trash(self.remove(job))
+
+    def remove(self, job: Job) -> Path:
+        """Take a job's files out of the spool at once; returns where they are until `empty_trash`.
+
+        Raises:
+            StorageError: the folder cannot be changed.
+        """
+        folder, trash = self.folder(job.id), self.root / f"{_TRASH}{job.id}"
         job.deleted = True
         self._leases.pop(job.id, None)
         with storage_errors(folder):
             if folder.exists():
-                trash = self.root / f"{_TRASH}{job.id}"
                 folder.rename(trash)
-                shutil.rmtree(trash)
         _log.info("files of job %s deleted", job.id)
+        return trash
 
     def _old(self, job: Job) -> bool:
         age = self.limits.max_age_s
@@ -142,6 +149,13 @@ class Spool:
     def _folders(self) -> Iterator[Path]:
         with storage_errors(self.root):
             yield from (folder for folder in self.root.iterdir() if folder.is_dir())
+
+
+def empty_trash(trash: Path) -> None:
+    """Free the bytes of removed files; may take as long as the disk likes."""
+    with storage_errors(trash):
+        if trash.exists():
+            shutil.rmtree(trash)
 
 
 def _folder_bytes(folder: Path) -> int:

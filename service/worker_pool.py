@@ -346,7 +346,8 @@ class WorkerPool:
         while not self._send(seat, message):
             delivery.wake.clear()
             try:
-                await asyncio.wait_for(delivery.wake.wait(), RETRY_S)
+                async with asyncio.timeout(RETRY_S):
+                    await delivery.wake.wait()
             except TimeoutError:
                 continue
 

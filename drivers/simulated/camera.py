@@ -111,7 +111,7 @@ class SimulatedCamera:
         self._numbers = 0
         self._delivered = 0
         self._ring: list[Pixels] = []
-        self._ring_shows: list[float] = []
+        self._ring_shows: list[object] = []
         self._buffers: list[Pixels] = []
         self._forget_shots()
         _ = world.view, world.electrons_per_light, deviates()  # now: opening may take a second, a first frame may not
@@ -357,7 +357,9 @@ class SimulatedCamera:
     def _fill_ring(self) -> None:
         """Render the ring's frames, of what shone during the last exposure's time, unless that is what they show."""
         start = self._clock.now_ns() - self._taken.exposure_ns
-        shows = [segment.on_ns for segment in self._world.timeline.between(start, start + self._taken.exposure_ns)]
+        segments = self._world.timeline.between(start, start + self._taken.exposure_ns)
+        # One image all through looks the same whenever it was flipped to; a change within the exposure never does.
+        shows: list[object] = [segments[0].image] if len(segments) == 1 else [segment.on_ns for segment in segments]
         if len(self._ring) == self._options.ring and shows == self._ring_shows:
             return
         self._ring, self._ring_shows = [], shows
