@@ -235,7 +235,7 @@ class PmpDecoder:
         gains = np.asarray(self._gains(axis), dtype=np.float32)[:, None] / np.float32(4 * np.pi**2)
         phases = np.stack([self._phases[axis][:, sample][:, good] for sample in pair])
         per_variance = np.stack([gains / self._modulations[axis][:, sample][:, good] ** 2 for sample in pair])
-        level = np.mean([self._mean[sample][good] for sample in pair], axis=0, dtype=np.float32)
+        level = (self._mean[pair[0]][good] + self._mean[pair[1]][good]) * np.float32(0.5)
         return noise_of_pairs(ladder, phases, per_variance, level, self._centre(axis), self._camera.max_value)
 
     def _usable(self, axis: Axis, sample: slice, noise: NoiseModel) -> NDArray[np.bool_]:
