@@ -209,11 +209,12 @@ class GrayDecoder:
                     image = images.pixels[bit, ::stride][lit].astype(np.float32)
                     nearer = np.minimum(np.abs(image - white[lit]), np.abs(image - black[lit]))
                     ratios.append(nearer**2 / (2 * expected))
-        # The median of a chi-square variable of one degree is .455. Coarse bits have few borders of cells in them.
-        coarse = ratios[: max(len(ratios) // 2, 1)]
-        measured = float(np.median(np.concatenate(coarse))) / 0.455
+        # Coarse bits have few borders of cells in them; those are cut off at three sigmas, which leaves .973 of the
+        # mean square. (.455 is the median square: whole grey levels make it too coarse to be the measure itself.)
+        coarse = np.concatenate(ratios[: max(len(ratios) // 2, 1)])
         least = float(np.median(ROUNDING_VARIANCE / expected))
-        return max(measured, least)
+        within = coarse <= 9 * max(float(np.median(coarse)) / 0.455, least)
+        return max(float(coarse[within].mean()) / 0.973, least)
 
     # --- decoding -----------------------------------------------------------------------------------------------
 
