@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from scanner.errors import ConfigError, ScannerError, StorageError, SyncError
+from scanner.errors import ConfigError, DeviceError, ScannerError, StorageError, SyncError
 from scanner.stream import DecodedNote, Progress, Result
 from scanner.wire import ErrorBody, Refused, ScanStart, error_from_body
 from service.devices_link import DevicesLink
@@ -180,7 +180,7 @@ class Pipeline:
             await self._end(job, JobState.CANCELLED, reason="cancelled")
             return
         error = _error_of(ended)
-        await self._end(job, JobState.FAILED, reason=ended.reason or "refused", error=error)
+        await self._end(job, JobState.FAILED, reason=ended.reason or _reason_to_fail(error), error=error)
 
     async def room_for(self, job: Job, need: Need) -> None:
         """Make room in the spool for a planned scan.
@@ -385,6 +385,8 @@ def _reason_to_fail(error: ScannerError) -> str:
             return "sync_lost"
         case StorageError():
             return "disk_full"
+        case DeviceError():
+            return "device_lost"
         case ConfigError():
             return "refused"
         case _:

@@ -8,6 +8,7 @@ new scan is refused.
 from __future__ import annotations
 
 import logging
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -161,9 +162,10 @@ def empty_trash(trash: Path) -> None:
 def _folder_bytes(folder: Path) -> int:
     """Bytes on disk: files reserved ahead count with what they reserved."""
     total = 0
-    for path in folder.rglob("*"):
-        try:
-            total += path.stat().st_blocks * 512
-        except FileNotFoundError:
-            continue  # a temporary file of a writer, renamed meanwhile
+    for parent, _, names in os.walk(folder):  # what is removed meanwhile counts nothing
+        for name in names:
+            try:
+                total += (Path(parent) / name).stat().st_blocks * 512
+            except FileNotFoundError:
+                continue
     return total

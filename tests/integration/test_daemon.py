@@ -364,6 +364,7 @@ def test_a_scan_without_room_is_refused_before_anything_is_written() -> None:
             client.scan("mcp")
         assert "spool_limit_gb" in str(caught.value.hint)
         job = client.list_scans()[-1]
+        assert job["reason"] == "disk_full"
         assert not (Path(endpoint.removeprefix("ipc://")).parent / "spool" / job["id"]).exists()
 
 
