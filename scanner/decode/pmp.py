@@ -249,10 +249,10 @@ class PmpDecoder:
         return np.asarray(gains * self._variance(noise, sample))
 
     def _variance(self, noise: NoiseModel, pixels: slice) -> NDArray[np.float32]:
-        prior = noise.variance(self._mean[pixels])
-        return np.asarray(
-            (PRIOR_FREEDOM * prior + self._residual[pixels]) / (PRIOR_FREEDOM + self._freedom), dtype=np.float32
-        )
+        # The plain form of what the kernel does.
+        model = noise.variance(self._mean[pixels])
+        own = (PRIOR_FREEDOM * model + self._residual[pixels]) / (PRIOR_FREEDOM + self._freedom)
+        return np.asarray(np.maximum(own, model), dtype=np.float32)
 
     def _least_modulation(self) -> float:
         finest = [self._modulations[axis][self._finest][:: self._stride] for axis in self._pattern.axes]

@@ -244,7 +244,8 @@ def unwrap(  # noqa: PLR0912, PLR0915  (one pass over a tile; calls would keep l
         tile_mean, tile_residual, tile_clipped = mean[start:stop], residual[start:stop], clipped[start:stop]
         for i in range(size):
             model = max(v0 + slope * tile_mean[i], least)
-            variance[i] = (prior * model + tile_residual[i]) * shrink
+            # A residual can show a pixel to be noisier than the model has it; a small one is luck more often than not.
+            variance[i] = max((prior * model + tile_residual[i]) * shrink, model)
             weakest[i] = np.float32(1e30)
             strongest[i] = _F0
             wrong[i] = _F0
@@ -305,9 +306,9 @@ def unwrap(  # noqa: PLR0912, PLR0915  (one pass over a tile; calls would keep l
             risk = wrong[i] > max_wrong or broken[i] > max_remainder
             why = 0 if inside else 5
             why = 4 if risk else why
-            why = 7 if moved else why
             why = 3 if weakest[i] < _F1 else why
             why = 1 if strongest[i] < _F1 else why
+            why = 7 if moved else why
             why = 2 if tile_clipped[i] != 0 else why
             good = why == 0
             out_position[i] = value if good else np.float32(np.nan)

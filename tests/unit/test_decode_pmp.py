@@ -1,0 +1,361 @@
+"""The PMP decoder on rendered frames: against a plain NumPy oracle, on captures of other systems, and in trouble."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from scanner.decode import Reason, decoder_for
+from scanner.decode.pmp import PmpDecoder, PmpThresholds, warm_up
+from scanner.errors import DecodeError
+from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, PmpPattern, ProjectorSize
+
+PROJECTOR = ProjectorSize(320, 240)
+CAMERA = CameraFormat(200, 150)
+FRINGES = PmpPattern(("y",), (1.0, 8.0, 40.0), (4, 4, 6))
+
+
+def surface(camera=CAMERA):
+    """(rows, columns) that each camera pixel sees: a bump before a tilted plane."""
+    y, x = np.mgrid[: camera.height, : camera.width] / np.array(camera.shape)[:, None, None]
+    bump = np.exp(-(((x - 0.5) / 0.25) ** 2) - ((y - 0.5) / 0.2) ** 2)
+    return 12 + 205 * y + 9 * bump, 15 + 285 * x - 12 * bump
+
+
+def render(pattern, camera=CAMERA, noise=0.0, albedo=0.8, ambient=0.04, seed=1, shape=None):
+    """Fringe frames of a pattern, without its images: intensities at the exact coordinates of `shape`."""
+    rows, columns = shape if shape is not None else surface(camera)
+    random = np.random.default_rng(seed)
+    frames = []
+    for axis in pattern.axes:
+        at, size = (rows, PROJECTOR.height) if axis == "y" else (columns, PROJECTOR.width)
+        for f, shifts in zip(pattern.frequencies, pattern.shifts, strict=True):
+            for n in range(shifts):
+                angle = 2 * np.pi * f * (at + pattern.origin) / size + pattern.sign * 2 * np.pi * n / shifts
+                light = ambient + 0.5 + 0.48 * np.cos(angle + pattern.offset)
+                grey = albedo * light * camera.max_value + random.normal(0, 1, camera.shape) * noise
+                frames.append(np.rint(np.clip(grey, 0, camera.max_value)).astype(camera.dtype))
+    return frames
+
+
+def decode(pattern, frames, camera=CAMERA, order=None, thresholds=None):
+    """Decode frames, None where one is missing."""
+    decoder = PmpDecoder(PatternSequence(PROJECTOR, pattern), camera, thresholds)
+    for position in order if order is not None else range(len(frames)):
+        if frames[position] is not None:
+            decoder.add(position, frames[position])
+    return decoder.finish()
+
+
+def oracle(pattern, frames, axis="y"):
+    """Plain NumPy: pixel by pixel least squares, then coarse to fine. For sets whose lowest has one period."""
+    size = PROJECTOR.along(axis)
+    first = sum(pattern.shifts) * pattern.axes.index(axis)
+    absolute = None
+    ladder = []
+    for f, shifts in zip(pattern.frequencies, pattern.shifts, strict=True):
+        alpha = pattern.sign * 2 * np.pi * np.arange(shifts) / shifts + pattern.offset
+        samples = np.stack(frames[first : first + shifts]).reshape(shifts, -1).astype(float)
+        design = np.stack([np.ones(shifts), np.cos(alpha), -np.sin(alpha)], axis=1)
+        _, p, q = np.linalg.lstsq(design, samples, rcond=None)[0]
+        ladder.append((f, np.arctan2(q, p) / (2 * np.pi), np.hypot(p, q)))
+        first += shifts
+    ladder.sort(key=lambda rung: rung[0])
+    before = None
+    for f, cycles, _ in ladder:
+        absolute = cycles % 1.0 if absolute is None else cycles + np.rint(absolute * f / before - cycles)
+        before = f
+    return (absolute / before * size - pattern.origin).reshape(frames[0].shape), ladder[-1][2].reshape(frames[0].shape)
+
+
+# --- right values -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("frequencies", "shifts"),
+    [((1.0, 8.0, 40.0), (4, 4, 6)), ((1.0, 8.0), (3, 3)), ((16.0, 1.0), (3, 5)), ((0.9, 6.3, 31.5), (5, 3, 4))],
+)
+@pytest.mark.parametrize("bits", [8, 16])
+def test_it_finds_what_plain_numpy_finds(frequencies, shifts, bits):
+    camera = CameraFormat(CAMERA.width, CAMERA.height, bits)
+    pattern = PmpPattern(("y",), frequencies, shifts)
+    frames = render(pattern, camera, noise=camera.max_value / 400)
+    decoded = decode(pattern, frames, camera)
+    rows, modulation = oracle(pattern, frames)
+    good = np.isfinite(decoded.rows)
+    assert good.mean() > 0.97
+    assert np.abs(decoded.rows - rows)[good].max() < 2e-3
+    assert np.allclose(decoded.modulation, modulation, rtol=1e-4)
+    assert np.allclose(decoded.albedo, np.mean(frames, axis=0), rtol=0.1)
+    assert decoded.columns is None
+    assert decoded.sigma_columns is None
+    assert decoded.rows.dtype == decoded.confidence.dtype == np.float32
+
+
+def test_a_fit_of_one_set_has_mean_and_residual_of_least_squares():
+    pattern = PmpPattern(("y",), (1.0,), (5,), sign=1, offset=0.4)
+    frames = render(pattern, noise=3)
+    decoded = decode(pattern, frames)
+    samples = np.stack(frames).reshape(5, -1).astype(float)
+    assert np.allclose(decoded.albedo.ravel(), samples.mean(axis=0), atol=1e-3)
+
+
+@pytest.mark.parametrize("frequencies", [(59.0, 64.0, 70.0), (70.0, 59.0, 64.0), (20.3, 23.45, 27.5)])
+def test_sets_without_a_unit_frequency_are_unwrapped_by_their_beats(frequencies):
+    pattern = PmpPattern(("y",), frequencies, (8, 8, 8))
+    rows, _ = surface()
+    decoded = decode(pattern, render(pattern, noise=0.4))
+    good = np.isfinite(decoded.rows)
+    assert good.mean() > 0.97
+    assert np.abs(decoded.rows - rows)[good].max() < 0.3
+
+
+def test_ambiguous_sets_are_refused():
+    with pytest.raises(DecodeError, match=re.escape("8, 16 do not tell one end")):
+        PmpDecoder(PatternSequence(PROJECTOR, PmpPattern(("y",), (8.0, 16.0), (4, 4))), CAMERA)
+
+
+def test_both_axes_are_decided_together():
+    pattern = PmpPattern(("x", "y"), (1.0, 8.0), (4, 4))
+    frames = render(pattern, noise=0.5)
+    for n in range(3):
+        frames[n] = frames[n].copy()
+        frames[n][40:60, 50:70] = 255
+    decoded = decode(pattern, frames)
+    rows, columns = surface()
+    good = np.isfinite(decoded.rows)
+    assert (good == np.isfinite(decoded.columns)).all()
+    assert (decoded.reason[40:60, 50:70] == Reason.CLIPPED).all()
+    assert good.mean() > 0.9
+    assert np.abs(decoded.rows - rows)[good].max() < 1
+    assert np.abs(decoded.columns - columns)[good].max() < 1
+    assert np.isfinite(decoded.sigma_rows[good]).all()
+    assert np.isfinite(decoded.sigma_columns[good]).all()
+
+
+@pytest.mark.parametrize(("sign", "offset", "origin"), [(1, 0.0, 0.0), (-1, 1.9, 0.0), (1, -0.7, 3.5)])
+def test_captures_of_other_systems_have_their_own_sign_offset_and_origin(sign, offset, origin):
+    pattern = PmpPattern(("y",), (1.0, 8.0, 40.0), (4, 3, 6), sign, offset, origin)
+    rows, _ = surface()
+    decoded = decode(pattern, render(pattern, noise=0.3))
+    good = np.isfinite(decoded.rows)
+    assert good.mean() > 0.97
+    assert np.abs(decoded.rows - rows)[good].max() < 0.15
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 16])
+def test_more_bits_are_more_precise(bits):
+    camera = CameraFormat(CAMERA.width, CAMERA.height, bits)
+    rows, _ = surface(camera)
+    decoded = decode(FRINGES, render(FRINGES, camera), camera)
+    good = np.isfinite(decoded.rows)
+    assert good.mean() > 0.98
+    # Rounding leaves sqrt(1/12) levels; of B = .38 of the range and six shifts, in a fringe of six rows.
+    sigma = 240 / 40 / (2 * np.pi) * np.sqrt(2 / 6 / 12) / (0.8 * 0.48 * camera.max_value)
+    assert 0.7 * sigma < np.std((decoded.rows - rows)[good]) < 1.4 * sigma + 3e-5
+
+
+# --- frames as they come ------------------------------------------------------------------------------------------
+
+
+def test_frames_may_come_in_any_order():
+    frames = render(FRINGES, noise=0.5)
+    straight = decode(FRINGES, frames)
+    order = np.random.default_rng(3).permutation(len(frames))
+    shuffled = decode(FRINGES, frames, order=order)
+    assert np.array_equal(np.isfinite(straight.rows), np.isfinite(shuffled.rows))
+    assert np.nanmax(np.abs(straight.rows - shuffled.rows)) < 1e-3
+
+
+def test_frames_around_the_fringes_are_taken_and_left_out():
+    sequence = PatternSequence.bracketed(PROJECTOR, FRINGES)
+    decoder = decoder_for(sequence, CAMERA)
+    frames = dict(zip(sequence.fringes, render(FRINGES, noise=0.5), strict=True))
+    for position in range(len(sequence)):
+        decoder.add(position, frames.get(position, np.full(CAMERA.shape, 255, np.uint8)))
+    assert np.isfinite(decoder.finish().rows).mean() > 0.97
+
+
+def test_the_frame_is_not_kept():
+    decoder = PmpDecoder(PatternSequence(PROJECTOR, FRINGES), CAMERA)
+    buffer = np.empty(CAMERA.shape, np.uint8)
+    for position, frame in enumerate(render(FRINGES, noise=0.5)):
+        buffer[:] = frame
+        decoder.add(position, buffer)
+    buffer[:] = 0
+    assert np.isfinite(decoder.finish().rows).mean() > 0.97
+
+
+@pytest.mark.parametrize("lost", [(5,), (0, 9), (8, 13)])
+def test_a_set_that_lost_a_frame_is_solved_from_the_rest(lost):
+    frames = [frame if n not in lost else None for n, frame in enumerate(render(FRINGES, noise=0.5))]
+    rows, _ = surface()
+    decoded = decode(FRINGES, frames)
+    good = np.isfinite(decoded.rows)
+    assert good.mean() > 0.95
+    assert np.abs(decoded.rows - rows)[good].max() < 0.3
+    warnings = " ".join(decoded.warnings)
+    assert all(re.search(rf"missing: [\d, ]*\b{n}\b", warnings) for n in lost)
+
+
+def test_three_shifts_cannot_lose_one():
+    pattern = PmpPattern(("y",), (1.0, 8.0), (4, 3))
+    frames = render(pattern)
+    frames[5] = None
+    with pytest.raises(DecodeError, match="frames 5 are missing"):
+        decode(pattern, frames)
+
+
+def test_a_set_that_never_came_is_named():
+    frames = render(FRINGES)
+    frames[4:8] = [None] * 4
+    with pytest.raises(DecodeError, match="frames 4, 5, 6, 7 are missing"):
+        decode(FRINGES, frames)
+    with pytest.raises(DecodeError, match="frames 0, 1"):
+        decode(FRINGES, [None] * len(frames))
+
+
+@pytest.mark.parametrize(
+    ("position", "frame", "says"),
+    [
+        (14, np.zeros((150, 200), np.uint8), "frame 14 does not exist: the pattern has 14 frames"),
+        (-1, np.zeros((150, 200), np.uint8), "frame -1 does not exist"),
+        (2, np.zeros((150, 200), np.uint8), "frame 2 was given before"),
+        (3, np.zeros((200, 150), np.uint8), "frame 3 is 150 x 200 px, the camera's format 200 x 150"),
+        (3, np.zeros((150, 200, 3), np.uint8), "frame 3 is 3 x 200 x 150 px"),
+        (3, np.zeros((150, 200), np.uint16), "frame 3 has dtype uint16; 8 bits come as uint8"),
+        (3, np.zeros((150, 200), np.float32), "float32"),
+    ],
+)
+def test_frames_that_cannot_belong_are_refused(position, frame, says):
+    decoder = decoder_for(PatternSequence(PROJECTOR, FRINGES), CAMERA)
+    frames = render(FRINGES, noise=0.5)
+    decoder.add(2, frames[2])
+    with pytest.raises(DecodeError, match=re.escape(says)):
+        decoder.add(position, frame)
+    for n, good in enumerate(frames):
+        if n != 2:
+            decoder.add(n, good)
+    assert np.isfinite(decoder.finish().rows).mean() > 0.97
+
+
+def test_other_methods_are_refused():
+    with pytest.raises(DecodeError, match="cannot decode method 'gray'"):
+        PmpDecoder(PatternSequence(PROJECTOR, GrayPattern(("x",), 9, 9)), CAMERA)
+    with pytest.raises(DecodeError, match="no decoder 'best'"):
+        decoder_for(PatternSequence(PROJECTOR, FRINGES), CAMERA, "best")
+
+
+# --- undecided rather than wrong ----------------------------------------------------------------------------------
+
+
+def test_every_pixel_says_why_it_has_no_value():
+    frames = [frame.copy() for frame in render(FRINGES, noise=0.7)]
+    random = np.random.default_rng(5)
+    for n, frame in enumerate(frames):
+        frame[:20, :20] = np.clip(np.rint(random.normal(3, 0.7, (20, 20))), 0, 255)  # not lit
+        frame[:20, 40:60] = np.clip(np.rint(random.normal(90, 0.7, (20, 20))), 0, 255)  # lit by something else
+        frame[:20, 80:100] = np.minimum(frame[:20, 80:100].astype(int) * 2, 255)  # glare
+        if n >= 8:
+            frame[:20, 120:140] = np.clip(np.rint(random.normal(90, 0.7, (20, 20))), 0, 255)  # blurred away
+        if n % 2:
+            frame[:20, 160:180] = random.integers(0, 250, (20, 20))  # something moved
+    decoded = decode(FRINGES, frames)
+    reasons = [decoded.reason[4:16, x + 4 : x + 16] for x in (0, 40, 80, 120, 160)]
+    assert (reasons[0] == Reason.SHADOW).all()
+    assert (reasons[1] == Reason.SHADOW).all()
+    assert (reasons[2] == Reason.CLIPPED).mean() > 0.9
+    assert (reasons[3] == Reason.LOW_MODULATION).all()
+    assert (reasons[4] == Reason.MOVED).mean() > 0.9
+    undecided = decoded.reason != Reason.VALUE
+    for values in (decoded.rows, decoded.sigma_rows):
+        assert np.array_equal(np.isnan(values), undecided)
+    assert np.array_equal(decoded.confidence == 0, undecided)
+    assert decoded.details["counts"]["value"] == np.count_nonzero(~undecided)
+
+
+@pytest.mark.parametrize("frequencies", [(1.0, 8.0, 40.0), (59.0, 64.0, 70.0), (1.0, 16.0)])
+@pytest.mark.parametrize("shifts", [3, 8])
+@pytest.mark.parametrize("noise", [4.0, 12.0])
+def test_noise_costs_pixels_and_not_truth(frequencies, shifts, noise):
+    pattern = PmpPattern(("y",), frequencies, (shifts,) * len(frequencies))
+    camera = CameraFormat(400, 300)
+    shape = surface(camera)
+    albedo = 0.08 + 0.7 * (np.mgrid[:300, :400][1] / 400)
+    decoded = decode(pattern, render(pattern, camera, noise, albedo, shape=shape), camera)
+    good = np.isfinite(decoded.rows)
+    wrong = np.abs(decoded.rows - shape[0]) > 0.5 * 240 / max(frequencies)
+    assert np.count_nonzero(wrong & good) <= max(1e-4 * np.count_nonzero(good), 1)
+    assert decoded.confidence[good].min(initial=1) >= 0.9998
+
+
+def test_the_ends_of_the_field_are_not_mistaken_for_one_another():
+    pattern = PmpPattern(("y",), (1.0, 8.0), (6, 6))
+    y = np.linspace(-0.45, 239.45, CAMERA.height)[:, None] + np.zeros(CAMERA.shape)
+    decoded = decode(pattern, render(pattern, noise=2.0, shape=(y, y)))
+    good = np.isfinite(decoded.rows)
+    assert good[2:-2].mean() > 0.99
+    assert np.abs(decoded.rows - y)[good].max() < 3
+    assert (decoded.reason[[0, -1]] == Reason.BORDER).mean() > 0.5
+
+
+@pytest.mark.parametrize("noise", [0.6, 1.5, 3.0])
+@pytest.mark.parametrize("shifts", [3, 4, 8])
+def test_sigma_is_what_the_error_turns_out_to_be(noise, shifts):
+    pattern = PmpPattern(("y",), (1.0, 8.0, 40.0), (shifts,) * 3)
+    camera = CameraFormat(400, 300)
+    rows, columns = surface(camera)
+    albedo = 0.4 + 0.4 * (np.sin(columns / 30) > 0)
+    decoded = decode(pattern, render(pattern, camera, noise, albedo, shape=(rows, columns)), camera)
+    good = np.isfinite(decoded.rows)
+    ratio = (decoded.rows - rows)[good] / decoded.sigma_rows[good]
+    assert good.mean() > 0.95
+    assert 0.8 < np.sqrt(np.mean(ratio**2)) < 1.3
+    for bright in (albedo > 0.6, albedo < 0.6):
+        here = (decoded.rows - rows)[good & bright] / decoded.sigma_rows[good & bright]
+        assert 0.75 < np.sqrt(np.mean(here**2)) < 1.35
+
+
+def test_a_response_that_is_not_corrected_leaves_no_wrong_fringe():
+    pattern = PmpPattern(("y",), (1.0, 8.0, 40.0), (3, 3, 3))
+    camera = CameraFormat(400, 300)
+    rows, columns = surface(camera)
+    frames = [
+        np.rint(255 * (frame / 255.0) ** 2.2).astype(np.uint8)
+        for frame in render(pattern, camera, 1.0, 0.9, shape=(rows, columns))
+    ]
+    decoded = decode(pattern, frames, camera)
+    good = np.isfinite(decoded.rows)
+    assert np.count_nonzero(np.abs(decoded.rows - rows)[good] > 3) == 0
+
+
+def test_exact_frames_and_black_frames_raise_no_warning():
+    pattern = PmpPattern(("y",), (1.0, 8.0), (8, 8))
+    camera = CameraFormat(CAMERA.width, CAMERA.height, 16)
+    assert np.isfinite(decode(pattern, render(pattern, camera), camera).rows).mean() > 0.95
+    black = decode(pattern, [np.zeros(CAMERA.shape, np.uint8)] * 16)
+    assert (black.reason == Reason.SHADOW).all()
+    white = decode(pattern, [np.full(CAMERA.shape, 255, np.uint8)] * 16)
+    assert (white.reason == Reason.CLIPPED).all()
+
+
+def test_wide_steps_are_warned_of():
+    pattern = PmpPattern(("y",), (1.0, 40.0), (8, 8))
+    assert any("40 is unwrapped by 1" in warning for warning in decode(pattern, render(pattern)).warnings)
+
+
+def test_thresholds_can_be_chosen_and_are_reported():
+    frames = render(FRINGES, noise=0.5)
+    strict = decode(FRINGES, frames, thresholds=PmpThresholds(min_modulation_levels=120))
+    assert (strict.reason == Reason.SHADOW).all()
+    assert strict.details["thresholds"]["min_modulation_levels"] == 120
+    report = decode(FRINGES, frames).details
+    assert report["method"] == "pmp"
+    assert report["unwrapping"]["y"]["frequencies"] == [1.0, 8.0, 40.0]
+    assert report["noise"]["measured"] is True
+
+
+def test_kernels_compile_before_they_are_needed():
+    warm_up()
