@@ -195,10 +195,9 @@ def _follower(folder: Path, lines: ProgressLines) -> Callable[[Event], None]:
                 check_room(folder, int(fields["bytes"]))
             case "frame" | "acquiring":  # the latter is the state that stands for events that were lost
                 done, total = int(fields.get("captured", 0)), int(fields.get("total", 0))
-                if not total:
-                    return
-                lines.stage("capturing", total)
-                lines.advance(done, total, f"{done} of {total} frames")
+                lines.stage("capturing" if total else "preparing", total or None)
+                if total:
+                    lines.advance(done, total, f"{done} of {total} frames")
             case "retake":
                 lines.note(f"{fields.get('retakes', 'some')} frames so far were out of step and taken again")
             case "acquired":

@@ -75,7 +75,7 @@ def test_a_scan_told_to_stop_leaves_nothing(number: signal.Signals, status: int,
     with running("scan", "--rig", "simulated:quick/board", "--repeat", "20", "-o", folder) as scan:
         assert scan.stderr is not None
         for line in scan.stderr:
-            if line.startswith("preparing"):  # frames are being taken
+            if line.startswith("starting"):  # it is over: the job has begun, and has twenty repetitions before it
                 break
         scan.send_signal(number)
         out, _ = scan.communicate(timeout=PATIENCE_S)
