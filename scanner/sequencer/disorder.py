@@ -44,5 +44,6 @@ def sync_error(
     return SyncError(
         f"{named} out of step with the projector{tried}: {detail}",
         frames=frames,
-        hint="measure the projector's latency (fringed calibrate sync), and look at the timing diagram (fringed audit)",
+        hint="take latency_us and settle_us out of the rig file so that they are measured, or raise dwell; "
+        "fringed audit draws the timing",
     )

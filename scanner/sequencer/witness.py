@@ -36,7 +36,7 @@ LIT_SHARE = 0.15
 LEAST_NOISE = 12**-0.5
 """Grey levels: rounding to whole levels."""
 
-DARK_HINT = "is the lens cap off, the projector on and awake, and the exposure long enough? Look at fringed preview"
+DARK_HINT = "is the lens cap off, the projector on and awake, and the exposure long enough?"
 
 Array = NDArray[np.float32]
 
