@@ -137,7 +137,11 @@ def streaming_rig(endpoint: str, spool: Path) -> RigConfig:
                 "settings": {"exposure_us": 1000.0},
                 "options": {"ring": 4, "period_us": 0.0},
             },
-            "projector": {"driver": "simulated", "device": "casey2011/bust", "options": {"kind": "static"}},
+            "projector": {
+                "driver": "simulated",
+                "device": "casey2011/bust",
+                "options": {"kind": "static", "modulation": "none"},
+            },
             "daemon": {"endpoint": endpoint, "spool": str(spool), "workers": 0, "retention": {"min_free_gb": 0.0}},
         }
     )

@@ -359,7 +359,9 @@ class SimulatedCamera:
         start = self._clock.now_ns() - self._taken.exposure_ns
         segments = self._world.timeline.between(start, start + self._taken.exposure_ns)
         # One image all through looks the same whenever it was flipped to; a change within the exposure never does.
-        shows: list[object] = [segments[0].image] if len(segments) == 1 else [segment.on_ns for segment in segments]
+        images = [segment.image for segment in segments]
+        one = all(image is images[0] for image in images)
+        shows: list[object] = [images[0]] if one else [segment.on_ns for segment in segments]
         if len(self._ring) == self._options.ring and shows == self._ring_shows:
             return
         self._ring, self._ring_shows = [], shows
