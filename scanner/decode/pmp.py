@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from scanner.patterns import CameraFormat, PatternSequence, PmpPattern
 from scanner.patterns.description import Axis, ProjectorSize
 from scanner.patterns.pmp import FringeSet
 
-SAMPLE = 30_000
+SAMPLE = 20_000
 """Pixels from which noise and agreement of a whole scan are judged: their medians are good to 1 %."""
 
 PRIOR_FREEDOM = 8.0
@@ -241,7 +241,7 @@ class PmpDecoder:
     def _usable(self, axis: Axis, sample: slice, noise: NoiseModel) -> NDArray[np.bool_]:
         b2 = self._modulations[axis][:, sample] ** 2
         enough = self._thresholds.min_modulation_sigmas**2 * self._noise_of_b2(axis, sample, noise)
-        good = (b2 > max(self._least_modulation() ** 2, 1e-12)) & (b2 > enough)
+        good = (b2 > max(self._least_modulation**2, 1e-12)) & (b2 > enough)
         return np.asarray(good.all(axis=0) & (self._clipped[sample] == 0))
 
     def _noise_of_b2(self, axis: Axis, sample: slice, noise: NoiseModel) -> NDArray[np.float32]:
@@ -254,6 +254,7 @@ class PmpDecoder:
         own = (PRIOR_FREEDOM * model + self._residual[pixels]) / (PRIOR_FREEDOM + self._freedom)
         return np.asarray(np.maximum(own, model), dtype=np.float32)
 
+    @cached_property
     def _least_modulation(self) -> float:
         finest = [self._modulations[axis][self._finest][:: self._stride] for axis in self._pattern.axes]
         brightest = max(float(np.quantile(b, 0.99)) for b in finest)
@@ -289,7 +290,7 @@ class PmpDecoder:
             f32(errors2), f32(errors2.sum(axis=1) * systematic**2),
             f32([noise.read, noise.per_level, ROUNDING_VARIANCE, PRIOR_FREEDOM, 1 / (PRIOR_FREEDOM + freedom)]),
             f32([along, self._pattern.origin, ladder.frequencies[0] * centre, ladder.frequencies[-1], centre - 0.5]),
-            f32([self._least_modulation(), t.min_modulation_sigmas**2, t.max_residual_sigmas**2,
+            f32([self._least_modulation, t.min_modulation_sigmas**2, t.max_residual_sigmas**2,
                  t.max_residual_share**2, t.max_remainder_sigmas**2, 1 - t.min_unwrap_probability, t.edge_sigmas]),
             ladder.periodic, self._finest,
             maps.position, maps.sigma, maps.confidence, maps.reason,
@@ -337,10 +338,10 @@ class PmpDecoder:
         ladders: Mapping[Axis, Ladder],
         remainders: Mapping[Axis, list[Remainder]],
     ) -> dict[str, Any]:
-        counts = np.bincount(reason, minlength=len(Reason))
+        counts = {r.name.lower(): int(np.count_nonzero(reason == np.uint8(r))) for r in Reason}
         return {
             "method": "pmp",
-            "counts": {r.name.lower(): int(counts[r]) for r in Reason if counts[r]},
+            "counts": {name: count for name, count in counts.items() if count},
             "thresholds": asdict(self._thresholds),
             "noise": asdict(noise),
             "unwrapping": {

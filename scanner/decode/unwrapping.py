@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations, product
 
 import numpy as np
@@ -64,6 +65,12 @@ def plan_ladder(frequencies: Sequence[float], gains: Sequence[float]) -> Ladder:
     Raises:
         DecodeError: no combination of the sets has one period or less over the projector.
     """
+    # Asked for by every scan of a rig, with the same answer; the gains of a fit differ in their last digits.
+    return _plan(tuple(float(f) for f in frequencies), tuple(round(float(g), 9) for g in gains))
+
+
+@lru_cache(maxsize=32)
+def _plan(frequencies: tuple[float, ...], gains: tuple[float, ...]) -> Ladder:
     f = np.asarray(frequencies, dtype=np.float64)
     g = np.sqrt(np.asarray(gains, dtype=np.float64))
     m, beats = _candidates(f)
