@@ -1,0 +1,61 @@
+"""What a scan projects by default, on any projector; no device is opened."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scanner.errors import ConfigError, DecodeError
+from scanner.patterns import McpPattern, PatternSequence, PmpPattern, ProjectorSize
+from scanner.patterns.sequence import Precorrection
+from service.scan_setup import METHODS, inverse_table, pattern_for
+
+SIZES = [(320, 240), (640, 360), (854, 480), (912, 1140), (1152, 864), (1280, 800), (1920, 1080), (3840, 2160)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("axis", ["x", "y"])
+@pytest.mark.parametrize("method", METHODS)
+def test_defaults_fit_every_projector(size: tuple[int, int], axis: str, method: str) -> None:
+    projector = ProjectorSize(*size)
+    pattern = pattern_for(method, {}, axis, projector)  # type: ignore[arg-type]
+    sequence = PatternSequence.bracketed(projector, pattern)
+    described = pattern.describe()
+    assert described.get("axis", described.get("axes")) in (axis, [axis])
+    assert sequence.image(len(sequence) // 2).shape == (size[1], size[0])
+
+
+def test_a_projector_that_is_large_enough_gets_the_published_patterns() -> None:
+    projector = ProjectorSize(1152, 864)
+    assert pattern_for("pmp", {}, "y", projector) == PmpPattern(axes=("y",), frequencies=(1, 8, 64), shifts=(8, 8, 8))
+    assert pattern_for("mcp", {}, "y", projector) == McpPattern(axis="y")
+
+
+def test_given_members_go_before_defaults() -> None:
+    projector = ProjectorSize(1152, 864)
+    pattern = pattern_for("pmp", {"frequencies": [1, 5], "axes": ["x", "y"]}, "y", projector)
+    assert pattern == PmpPattern(axes=("x", "y"), frequencies=(1, 5), shifts=(8, 8))
+    with pytest.raises(DecodeError, match="shifts"):
+        pattern_for("pmp", {"shifts": [2, 2, 2]}, "y", projector)
+
+
+def test_what_is_no_method() -> None:
+    with pytest.raises(ConfigError, match="laser") as caught:
+        pattern_for("laser", {}, "y", ProjectorSize(640, 480))
+    assert "pmp" in str(caught.value.hint)
+    with pytest.raises(ConfigError, match="too small"):
+        pattern_for("mcp", {}, "y", ProjectorSize(16, 12))
+
+
+@pytest.mark.parametrize("gamma", [0.5, 1.0, 2.2])
+def test_the_inverse_of_a_response_makes_light_linear(gamma: float) -> None:
+    light = (np.arange(256) / 255) ** gamma
+    values = Precorrection(table=inverse_table(light)).apply(np.linspace(0, 1, 256, dtype=np.float32))
+    steps = np.diff(light).max()
+    assert np.abs(light[values] - np.linspace(0, 1, 256)).max() <= steps
+
+
+@pytest.mark.parametrize("table", [[0.0] * 256, list(np.linspace(1, 0, 256)), [0.0, 1.0], list(np.linspace(0, 2, 256))])
+def test_what_is_no_response(table: list[float]) -> None:
+    with pytest.raises(ConfigError, match="rising"):
+        inverse_table(table)
