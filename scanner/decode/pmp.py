@@ -1,9 +1,10 @@
 """Decoding PMP: fringe sets of any frequencies and shifts to absolute projector coordinates.
 
 Frames are taken in any order. As soon as a set is whole, one pass makes its phase and modulation and the frames'
-memory serves the next set; after the last frame one pass an axis unwraps up a ladder of beats (`unwrapping`), and a
-pixel whose fringe order is not nearly certain stays undecided. How noisy the pixels are is taken from the capture
-itself: from the residual of the fit where a set has four shifts or more, else from how well neighbouring rungs agree.
+memory serves the next set; after the last frame one pass an axis unwraps up a ladder of beats (`unwrapping`). A pixel
+whose fringe order is not nearly certain, and not plain from its neighbours, stays undecided. How noisy the pixels are
+is taken from the capture itself: from the residual of the fit where a set has four shifts or more, else from how well
+neighbouring rungs agree.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from scanner.decode import Decoded, Map, Reason
 from scanner.decode.agreement import PAIR_DISTANCE, Remainder, agreement, noise_of_pairs
 from scanner.decode.frames import FrameCheck
+from scanner.decode.neighbours import settle
 from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel, default_noise, fit_noise
 from scanner.decode.pmp_kernels import fit_set, unwrap
 from scanner.decode.unwrapping import Ladder, plan_ladder
@@ -118,6 +120,7 @@ class PmpDecoder:
         self._residual = _filled(pixels)
         self._clipped = np.full(pixels, 0, np.uint8)
         self._maps = {axis: _AxisMaps.empty(pixels) for axis in self._pattern.axes}
+        self._settled: dict[Axis, int] = {}
 
     @property
     def camera(self) -> CameraFormat:
@@ -295,6 +298,10 @@ class PmpDecoder:
             ladder.periodic, self._finest,
             maps.position, maps.sigma, maps.confidence, maps.reason,
         )  # fmt: skip
+        per_px = float(ladder.frequencies[-1]) / along
+        self._settled[axis] = settle(
+            maps.position, maps.sigma, maps.confidence, maps.reason, self._camera.width, per_px
+        )
 
     # --- the result ---------------------------------------------------------------------------------------------
 
@@ -349,6 +356,7 @@ class PmpDecoder:
                     "frequencies": [float(f) for f in ladder.frequencies],
                     "combinations": ladder.combinations.tolist(),
                     "remainders": [asdict(r) for r in remainders[axis]],
+                    "settled_by_neighbours": self._settled[axis],
                 }
                 for axis, ladder in ladders.items()
             },

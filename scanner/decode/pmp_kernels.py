@@ -206,6 +206,8 @@ def unwrap(  # noqa: PLR0912, PLR0915  (one pass over a tile; calls would keep l
 ) -> None:
     """Climb the ladder at every pixel; write projector coordinate, its sigma, confidence and reason.
 
+    Pixels at risk of a wrong order keep a tentative coordinate, for `neighbours.settle`.
+
     Args:
         phases, modulations: (K, P) float32 of the axis's sets; cycles, grey levels.
         mean: (P,) float32, A. residual: (P,) float32, sum of squared residuals of all sets. clipped: (P,) uint8.
@@ -311,8 +313,9 @@ def unwrap(  # noqa: PLR0912, PLR0915  (one pass over a tile; calls would keep l
             why = 7 if moved else why
             why = 2 if tile_clipped[i] != 0 else why
             good = why == 0
-            out_position[i] = value if good else np.float32(np.nan)
-            out_sigma[i] = deviation if good else np.float32(np.nan)
+            known = good or why == 4
+            out_position[i] = value if known else np.float32(np.nan)
+            out_sigma[i] = deviation if known else np.float32(np.nan)
             out_confidence[i] = max(_F1 - wrong[i], _F0) if good else _F0
             out_reason[i] = np.uint8(why)
 

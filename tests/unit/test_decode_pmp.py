@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from scanner.decode import Reason, decoder_for
+from scanner.decode.neighbours import CONFIDENCE, settle
 from scanner.decode.pmp import PmpDecoder, PmpThresholds, warm_up
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, PmpPattern, ProjectorSize
@@ -288,7 +289,7 @@ def test_noise_costs_pixels_and_not_truth(frequencies, shifts, noise):
     good = np.isfinite(decoded.rows)
     wrong = np.abs(decoded.rows - shape[0]) > 0.5 * 240 / max(frequencies)
     assert np.count_nonzero(wrong & good) <= max(1e-4 * np.count_nonzero(good), 1)
-    assert decoded.confidence[good].min(initial=1) >= 0.9998
+    assert decoded.confidence[good].min(initial=1) >= CONFIDENCE - 1e-6
 
 
 def test_the_ends_of_the_field_are_not_mistaken_for_one_another():
@@ -344,6 +345,48 @@ def test_exact_frames_and_black_frames_raise_no_warning():
 def test_wide_steps_are_warned_of():
     pattern = PmpPattern(("y",), (1.0, 40.0), (8, 8))
     assert any("40 is unwrapped by 1" in warning for warning in decode(pattern, render(pattern)).warnings)
+
+
+def test_neighbours_settle_orders_that_a_pixel_leaves_open():
+    pattern = PmpPattern(("y",), (1.0, 16.0), (3, 3))
+    frames = render(pattern, noise=0.5)
+    random = np.random.default_rng(8)
+    for n in range(3):  # a noisy unit frequency leaves orders open here and there
+        frames[n] = np.clip(np.rint(frames[n] + random.normal(0, 8, CAMERA.shape)), 0, 255).astype(np.uint8)
+    decoded = decode(pattern, frames)
+    good = np.isfinite(decoded.rows)
+    settled = decoded.confidence == np.float32(CONFIDENCE)
+    assert decoded.details["unwrapping"]["y"]["settled_by_neighbours"] == np.count_nonzero(settled) > 500
+    assert good.mean() > 0.97
+    wrong = np.abs(decoded.rows - surface()[0]) > 7
+    assert np.count_nonzero(wrong & settled) == 0
+    assert np.count_nonzero(wrong & good) <= 3
+
+
+def test_neighbours_that_disagree_or_are_few_settle_nothing():
+    position = np.full((9, 9), 50, np.float32)
+    reason = np.full((9, 9), Reason.VALUE, np.uint8)
+    maps = [position, np.full((9, 9), 0.1, np.float32), np.ones((9, 9), np.float32), reason]
+
+    def settled(edit):
+        tried = [values.copy() for values in maps]
+        tried[3][4, 4] = Reason.UNWRAP_RISK
+        edit(tried[0], tried[3])
+        count = settle(*(values.reshape(-1) for values in tried), 9, 0.1)
+        assert (count == 1) == bool(np.isfinite(tried[0][4, 4])) == (tried[3][4, 4] == Reason.VALUE)
+        return float(tried[0][4, 4])
+
+    def put(at, value):
+        return lambda position, reason: position.__setitem__(at, value)
+
+    assert settled(put((4, 4), 50.5)) == 50.5
+    assert settled(put((4, 4), 60.5)) == pytest.approx(50.5)
+    assert settled(put((4, 4), 39.6)) == pytest.approx(49.6)
+    assert np.isnan(settled(put((4, 4), 70.0)))  # two fringes off: another surface
+    assert np.isnan(settled(put((4, 4), 52.0)))  # its phase does not continue theirs
+    assert np.isnan(settled(put((2, 2), 60.0)))  # they are on two fringes
+    assert settled(lambda position, reason: reason[:, :4].fill(Reason.SHADOW)) == 50  # 14 are left
+    assert np.isnan(settled(lambda position, reason: reason[:, :5].fill(Reason.UNWRAP_RISK)))  # 10
 
 
 def test_thresholds_can_be_chosen_and_are_reported():
