@@ -80,7 +80,7 @@ def children(daemon_pid: int, module: str = "") -> list[int]:
     return found
 
 
-def wait_for(true: Callable[[], Any], timeout_s: float = 10.0) -> Any:
+def wait_for(true: Callable[[], Any], timeout_s: float = 30.0) -> Any:
     deadline = time.monotonic() + timeout_s
     while not (found := true()):
         assert time.monotonic() < deadline, "waited in vain"
@@ -115,7 +115,7 @@ def test_a_capture_that_kills_its_worker_three_times_is_given_up_and_named(
     killed: set[int] = set()
     with Client(running.endpoint) as client:
         job = client.start_scan("pmp")
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 60
         while (status := client.call("scan.status", id=job))["state"] not in ("failed", "done"):
             assert time.monotonic() < deadline
             for worker in client.status()["workers"]:
@@ -179,7 +179,7 @@ def test_daemon_killed_with_a_scan_in_the_queue(daemon: Callable[..., RunningDae
 
 def test_a_client_lives_through_a_restart(daemon: Callable[..., RunningDaemon]) -> None:
     first = daemon(workers=0)
-    with Client(first.endpoint) as client:
+    with Client(first.endpoint, timeout_s=30) as client:
         job = client.start_scan("mcp")
         wait_for_event(client, job, "acquired")
         first.kill()
