@@ -8,6 +8,7 @@ order is not judged here: `scanner.sequencer` does that, before anything is deco
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -20,6 +21,9 @@ from scanner.decode.unwrapping import Ladder
 
 MIN_PIXELS = 400
 """Fewer usable pixels than this say nothing."""
+
+MIN_AGREEMENT = 0.3
+"""Mean cosine of remainders: chance gives 0, noise of a fifth of a fringe .45."""
 
 PAIR_DISTANCE = 2
 """Camera pixels between the two of a pair: near enough to share what is systematic, too far to share a blur's noise."""
@@ -64,6 +68,16 @@ def agreement(
         low, high = ladder.frequencies[j : j + 2]
         found.append(_remainder(low, high, remainder, errors2 @ cycles2, float(errors2.sum()), floor_cycles))
     return found
+
+
+def disagreements(axis: str, remainders: Sequence[Remainder]) -> tuple[str, ...]:
+    """What a user should know about steps whose two rungs have nothing to do with one another: nothing is decided."""
+    return tuple(
+        f"frequencies {r.low:g} and {r.high:g} along {axis} do not agree anywhere: are the frames in their order, and "
+        f'"sign" and "shifts" of the pattern right?'
+        for r in remainders
+        if r.pixels >= MIN_PIXELS and r.expected_sigma < _UNFOLDED_SIGMA and r.agreement < MIN_AGREEMENT
+    )
 
 
 def noise_of_pairs(

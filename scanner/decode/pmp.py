@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Map, Reason
-from scanner.decode.agreement import PAIR_DISTANCE, Remainder, agreement, noise_of_pairs
+from scanner.decode.agreement import PAIR_DISTANCE, Remainder, agreement, disagreements, noise_of_pairs
 from scanner.decode.frames import FrameCheck
 from scanner.decode.neighbours import settle
 from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel, default_noise, fit_noise
@@ -158,6 +158,7 @@ class PmpDecoder:
         remainders: dict[Axis, list[Remainder]] = {}
         for axis, ladder in ladders.items():
             remainders[axis] = self._agreement(axis, ladder, noise)
+            warnings += disagreements(axis, remainders[axis])
             self._unwrap(axis, ladder, noise, remainders[axis])
         warnings += ladders[self._pattern.axes[0]].warnings()
         return self._decoded(noise, ladders, remainders, warnings)

@@ -332,6 +332,23 @@ def test_a_response_that_is_not_corrected_leaves_no_wrong_fringe():
     assert np.count_nonzero(np.abs(decoded.rows - rows)[good] > 3) == 0
 
 
+@pytest.mark.parametrize("shifts", [3, 4, 8])
+@pytest.mark.parametrize("wrong", [0, 1, 2])
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_frames_in_a_wrong_order_leave_no_wrong_values(shifts, wrong, gamma):
+    pattern = PmpPattern(("y",), (1.0, 8.0, 40.0), (shifts,) * 3)
+    frames = render(pattern, noise=0.8, albedo=0.9)
+    frames = [np.rint(255 * (frame / 255.0) ** gamma).astype(np.uint8) for frame in frames]
+    one = shifts * wrong + 1
+    frames[one], frames[one + 1] = frames[one + 1], frames[one]
+    decoded = decode(pattern, frames)
+    good = np.isfinite(decoded.rows)
+    assert np.count_nonzero(np.abs(decoded.rows - surface()[0])[good] > 3) <= 1e-4 * good.size
+    if shifts == 3:
+        assert good.mean() < 0.01
+        assert any("do not agree anywhere" in warning for warning in decoded.warnings)
+
+
 def test_exact_frames_and_black_frames_raise_no_warning():
     pattern = PmpPattern(("y",), (1.0, 8.0), (8, 8))
     camera = CameraFormat(CAMERA.width, CAMERA.height, 16)
