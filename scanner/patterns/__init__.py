@@ -6,10 +6,10 @@ from scanner.patterns.description import (
     FrameRole,
     Pattern,
     ProjectorSize,
-    pattern_from_description,
 )
 from scanner.patterns.graycode import GrayPattern
 from scanner.patterns.mcp import McpPattern
+from scanner.patterns.methods import pattern_from_description
 from scanner.patterns.pmp import PmpPattern
 from scanner.patterns.sequence import PatternSequence
 

@@ -87,26 +87,6 @@ class Pattern(Protocol):
         """The description, without the positions of white, black and sentinels."""
 
 
-def pattern_from_description(description: Mapping[str, Any]) -> Pattern:
-    """The pattern that a description means.
-
-    Raises:
-        DecodeError: unknown method, missing or wrong members, named.
-    """
-    from scanner.patterns.graycode import GrayPattern  # noqa: PLC0415  (methods import this module)
-    from scanner.patterns.mcp import McpPattern  # noqa: PLC0415
-    from scanner.patterns.pmp import PmpPattern  # noqa: PLC0415
-
-    if not isinstance(description, Mapping):
-        raise DecodeError("pattern description is not an object")
-    methods: dict[str, Any] = {"pmp": PmpPattern, "mcp": McpPattern, "gray": GrayPattern}
-    method = description.get("method")
-    if method not in methods:
-        raise DecodeError(f"unknown pattern method {method!r}", hint=f"known methods: {', '.join(sorted(methods))}")
-    pattern: Pattern = methods[method].from_description(description)
-    return pattern
-
-
 # --- reading members, with errors that name them ------------------------------------------------------------------
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.errors import DecodeError
-from scanner.patterns.description import Axis, FrameRole, Pattern, ProjectorSize, pattern_from_description
+from scanner.patterns.description import Axis, FrameRole, Pattern, ProjectorSize
+from scanner.patterns.methods import pattern_from_description
 
 SENTINELS_BEFORE = (0.0, 1.0, 0.0)
 SENTINELS_AFTER = (1.0, 0.0, 1.0)

@@ -6,13 +6,14 @@
 from scanner.sequencer.audit import CaptureCheck, check_capture
 from scanner.sequencer.exposure import ExposureChoice
 from scanner.sequencer.exposure import auto as auto_exposure
+from scanner.sequencer.findings import Witness, Witnesses
 from scanner.sequencer.latency import measure as measure_latency
 from scanner.sequencer.plan import Mode, Plan, light_unit_ns, plan
 from scanner.sequencer.rig import Rig
 from scanner.sequencer.run import Acquisition, FinishReason, FrameSink, acquire
 from scanner.sequencer.timing_diagram import timing_diagram
 from scanner.sequencer.verify import FrameVerdict, verify
-from scanner.sequencer.witness import Witness, Witnesses, witness
+from scanner.sequencer.witness import witness
 
 __all__ = [
     "Acquisition",

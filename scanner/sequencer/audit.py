@@ -10,10 +10,11 @@ from scanner.capture import Capture
 from scanner.devices import Pixels
 from scanner.errors import DecodeError
 from scanner.sequencer.disorder import sync_error
+from scanner.sequencer.findings import Witnesses
 from scanner.sequencer.plan import Plan
 from scanner.sequencer.thumbnail import thumbnail
 from scanner.sequencer.verify import FrameVerdict, summary, verify
-from scanner.sequencer.witness import Witnesses, witness
+from scanner.sequencer.witness import witness
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from scanner.errors import DecodeError, ScannerError, SyncError
 from scanner.patterns import FrameRole, PatternSequence
+from scanner.sequencer.findings import DARK_HINT, Witnesses
 from scanner.sequencer.verify import FrameVerdict
-from scanner.sequencer.witness import DARK_HINT, Witnesses
 
 
 def set_of(sequence: PatternSequence, position: int) -> tuple[int, ...]:

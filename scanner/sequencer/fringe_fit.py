@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scanner.patterns import PmpPattern
 from scanner.patterns.pmp import FringeSet
-from scanner.sequencer.witness import NOISE_SIGMAS, Array, Scene
+from scanner.sequencer.findings import NOISE_SIGMAS, Array, Scene
 
 MIN_PIXELS = 150
 """Lit pixels of the thumbnail, fewer than which prove nothing."""

@@ -17,11 +17,12 @@ from scanner.devices import Camera, CameraFrame, CameraSettings, Flip, Pixels, P
 from scanner.errors import DeviceLost, ScannerError, SyncError
 from scanner.patterns import PatternSequence
 from scanner.sequencer.disorder import set_of, sync_error
+from scanner.sequencer.findings import Witnesses
 from scanner.sequencer.plan import Mode, Plan
 from scanner.sequencer.rig import Rig
 from scanner.sequencer.thumbnail import thumbnail
 from scanner.sequencer.verify import FrameVerdict, judge, summary, verify
-from scanner.sequencer.witness import Witnesses, witness
+from scanner.sequencer.witness import witness
 
 
 class FrameSink(Protocol):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from scanner.patterns import PmpPattern
 from scanner.patterns.pmp import FringeSet
+from scanner.sequencer.findings import Array, Scene, Witness, equal_positions, sigma_between
 from scanner.sequencer.fringe_fit import (
     MIN_PIXELS,
     Fit,
@@ -25,7 +26,6 @@ from scanner.sequencer.fringe_fit import (
     mean_vector,
     solve,
 )
-from scanner.sequencer.witness import Array, Scene, Witness, equal_positions, sigma_between
 from scanner.sequencer.witness_order import order_witnesses
 
 MAX_HARMONIC = 0.4

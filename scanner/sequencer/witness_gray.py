@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from scanner.patterns import GrayPattern
 from scanner.patterns.description import Axis
-from scanner.sequencer.witness import Scene, Witness
+from scanner.sequencer.findings import Scene, Witness
 
 MAX_UNEQUAL = 0.25
 """Median of |bit + inverse - white - black| over the contrast: a foreign frame in the pair leaves a half or more."""

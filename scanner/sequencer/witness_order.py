@@ -18,8 +18,8 @@ from scanner.errors import DecodeError
 from scanner.patterns import PmpPattern
 from scanner.patterns.description import Axis
 from scanner.patterns.sequence import BAR_COUNT, bar_light
+from scanner.sequencer.findings import Array, Scene, Witness
 from scanner.sequencer.fringe_fit import MIN_PIXELS, Fit, bright_pixels, mean_vector
-from scanner.sequencer.witness import Array, Scene, Witness
 
 LEAST_OFFSET = 0.05
 """Mean remainder, in fringes, that is allowed in any case: interreflections and slow drift of the lamp."""

@@ -1,0 +1,184 @@
+"""What witnesses look at and what they say: thumbnails as samples, and single findings. No judgement here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.devices import Pixels
+from scanner.patterns import PatternSequence
+from scanner.patterns.sequence import SENTINELS_AFTER, SENTINELS_BEFORE
+
+NOISE_SIGMAS = 5.0
+"""What is called lit, or different, stands this far above the noise."""
+
+LIT_SHARE = 0.15
+"""Of the contrast that the brightest half percent reaches: what is darker is scattered light more than pattern."""
+
+LEAST_NOISE = 12**-0.5
+"""Grey levels: rounding to whole levels."""
+
+DARK_HINT = "is the lens cap off, the projector on and awake, and the exposure long enough?"
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Witness:
+    """One finding. `value` is held against `limit`; `frames` are the positions it speaks against."""
+
+    name: str
+    passed: bool
+    value: float
+    limit: float
+    frames: tuple[int, ...] = ()
+    says: str = ""
+    whole: bool = False
+    """the order of the whole sequence is in doubt: single retakes cannot mend it"""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for capture.json."""
+        return {
+            "name": self.name,
+            "passed": self.passed,
+            "value": float(self.value),
+            "limit": float(self.limit),
+            "frames": list(self.frames),
+            "says": self.says,
+        }
+
+
+@dataclass(frozen=True)
+class Witnesses:
+    """All findings of a capture, and what they could not have revealed."""
+
+    items: tuple[Witness, ...] = ()
+    cannot_reveal: tuple[str, ...] = ()
+    dark: bool = False
+    """nothing in view is lit by the projector: there is nothing to judge, nor to decode"""
+
+    @property
+    def suspects(self) -> tuple[int, ...]:
+        """Positions of frames that content speaks against."""
+        return tuple(sorted({frame for item in self.items if not item.passed for frame in item.frames}))
+
+    @property
+    def whole(self) -> bool:
+        """Whether the order of the whole sequence is in doubt."""
+        return any(item.whole and not item.passed for item in self.items)
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing speaks against the plan."""
+        return not self.dark and all(item.passed for item in self.items)
+
+    def joined(self, other: Witnesses) -> Witnesses:
+        """The findings of two repetitions together."""
+        cannot = tuple(dict.fromkeys((*self.cannot_reveal, *other.cannot_reveal)))
+        return Witnesses((*self.items, *other.items), cannot, self.dark or other.dark)
+
+    def as_list(self) -> list[dict[str, Any]]:
+        """Plain data for capture.json's `witnesses`."""
+        return [item.as_dict() for item in self.items]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The thumbnails of one repetition as samples, and what all witnesses need to know of them."""
+
+    sequence: PatternSequence
+    frames: Mapping[int, Array]
+    """by position: (P,) float32 grey levels"""
+    shape: tuple[int, int]
+    max_value: int
+    noise: float
+    """1-sigma of one sample, grey levels"""
+    lit: NDArray[np.bool_]
+    """(P,) pixels that the projector's light reaches"""
+    contrast: float
+    """what that light adds to the brightest half percent of pixels, grey levels"""
+
+    def mean(self, position: int) -> float:
+        """Mean level of a frame over the lit pixels."""
+        return float(self.frames[position][self.lit].mean())
+
+
+def look(sequence: PatternSequence, thumbnails: Mapping[int, Pixels], max_value: int) -> Scene | None:
+    """Take the thumbnails as samples: noise, lit pixels. None if no pixel changes beyond the noise."""
+    frames = {p: pixels.reshape(-1).astype(np.float32) for p, pixels in sorted(thumbnails.items())}
+    shape = next(iter(thumbnails.values())).shape
+    noise = _noise(sequence, frames, (int(shape[0]), int(shape[1])))
+    stack = np.stack(list(frames.values()))
+    # The second largest minus the second smallest: one frame's outliers (a cosmic ray, a torn frame) light nothing.
+    ranked = np.sort(stack, axis=0)
+    spread = ranked[-2] - ranked[1] if len(stack) > 4 else ranked[-1] - ranked[0]
+    contrast = float(np.quantile(spread, 0.995))
+    # n normal samples range over about 2 sqrt(2 ln n) sigma.
+    range_of_noise = 2 * float(np.sqrt(2 * np.log(len(stack)))) * noise
+    if contrast < range_of_noise + NOISE_SIGMAS * noise:
+        return None
+    lit = spread > max(LIT_SHARE * contrast, range_of_noise + NOISE_SIGMAS * noise / 2)
+    return Scene(sequence, frames, (int(shape[0]), int(shape[1])), max_value, noise, lit, contrast)
+
+
+def sigma_between(a: Array, b: Array) -> float:
+    """1-sigma of one sample from two frames of one picture (or how far two pictures differ, on the same scale).
+
+    The largest twentieth of the differences, where something moved or a pixel is hot, is left out; a normal
+    distribution keeps 0.871 of its rms without them. (A median would count whole grey levels.)
+    """
+    squares = np.sort((a - b) ** 2)[: max(1, int(0.95 * a.size))]
+    return float(np.sqrt(squares.mean() / 2)) / 0.871
+
+
+def equal_positions(sequence: PatternSequence) -> Iterable[tuple[float, tuple[int, ...]]]:
+    """(light, positions) of the full-off and the full-on frames."""
+    levels: dict[float, list[int]] = {0.0: [], 1.0: []}
+    for position, level in zip(sequence.sentinels, SENTINELS_BEFORE + SENTINELS_AFTER, strict=False):
+        levels[level].append(position)
+    if sequence.black is not None:
+        levels[0.0].append(sequence.black)
+    if sequence.white is not None:
+        levels[1.0].append(sequence.white)
+    return [(level, tuple(sorted(positions))) for level, positions in levels.items()]
+
+
+def _noise(sequence: PatternSequence, frames: Mapping[int, Array], shape: tuple[int, int]) -> float:
+    """Of the pairs of equal frames, full-on ones if there are any since they are noisier, the pair that differs least.
+
+    A pair without any difference is one frame twice and says nothing. Planned equals may all be false, so no more is
+    believed than the grain of differences between any frames shows. Never below rounding.
+    """
+    pairs = list(pairwise(sorted(frames)))
+    pairs = pairs[:: -(-len(pairs) // 8)]
+    grain = float(np.quantile([_grain(frames[a] - frames[b], shape) for a, b in pairs], 0.25))
+    for _, positions in sorted(equal_positions(sequence), reverse=True):
+        here = [p for p in positions if p in frames]
+        found = [sigma_between(*_brighter(frames[a], frames[b])) for a, b in combinations(here, 2)]
+        if found := [sigma for sigma in found if sigma > 0]:
+            return max(min([*found, max(3 * grain, LEAST_NOISE)]), LEAST_NOISE)
+    return max(grain, LEAST_NOISE)
+
+
+def _grain(difference: Array, shape: tuple[int, int]) -> float:
+    """1-sigma of one sample of two frames, from the roughness of their difference image.
+
+    Second differences along rows and along columns, whichever is smoother: projected stripes are smooth along one of
+    them, and a texture scales with the light, which varies slowly. Median absolute value of a normal / 0.6745; a
+    second difference of the difference of two frames has 12 variances.
+    """
+    image = difference.reshape(shape)
+    rough = [float(np.median(np.abs(np.diff(image, 2, axis=axis)))) for axis in (0, 1) if image.shape[axis] > 2]
+    return min(rough, default=0.0) / 0.6745 / 12**0.5
+
+
+def _brighter(a: Array, b: Array) -> tuple[Array, Array]:
+    """The half of the pixels that is brighter, where there is noise to see."""
+    both = a + b
+    use = both >= np.median(both)
+    return a[use], b[use]
