@@ -17,8 +17,8 @@ from scanner.kernel import kernel
 REACH = 2
 """Camera pixels to each side: two are as far as a lens's blur ties pixels together."""
 
-MIN_NEIGHBOURS = 12
-"""Decided pixels of the 24 around: with fewer it may stand on the border of a surface."""
+MIN_NEIGHBOURS = 16
+"""Decided pixels of the 24 around: a pixel on the straight border of a surface has 14 at most."""
 
 MAX_SPREAD_CYCLES = 0.25
 """Of any neighbour's position from the pixel's, half of what would begin to leave the order open."""
@@ -27,7 +27,7 @@ MAX_BEND_CYCLES = 0.1
 """Of their mean from it: a surface's slope averages out, a jump does not."""
 
 CONFIDENCE = 0.999
-"""Of a pixel settled so. Of 5,239 such pixels of a real skull that Gray code knows, it contradicts one."""
+"""Of a pixel settled so: Gray code of a real scene knows 3,479 such pixels and contradicts none (3 / n at 95 %)."""
 
 _VALUE, _RISK, _SETTLED = np.uint8(Reason.VALUE), np.uint8(Reason.UNWRAP_RISK), np.uint8(255)
 

@@ -402,8 +402,8 @@ def test_neighbours_that_disagree_or_are_few_settle_nothing():
     assert np.isnan(settled(put((4, 4), 70.0)))  # two fringes off: another surface
     assert np.isnan(settled(put((4, 4), 52.0)))  # its phase does not continue theirs
     assert np.isnan(settled(put((2, 2), 60.0)))  # they are on two fringes
-    assert settled(lambda position, reason: reason[:, :4].fill(Reason.SHADOW)) == 50  # 14 are left
-    assert np.isnan(settled(lambda position, reason: reason[:, :5].fill(Reason.UNWRAP_RISK)))  # 10
+    assert settled(lambda position, reason: reason[:, :3].fill(Reason.SHADOW)) == 50  # 19 are left
+    assert np.isnan(settled(lambda position, reason: reason[:, :4].fill(Reason.UNWRAP_RISK)))  # 14
 
 
 def test_thresholds_can_be_chosen_and_are_reported():
