@@ -10,6 +10,7 @@ import json
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -144,16 +145,20 @@ class Scan:
             if progress is not None:
                 progress(name)
 
-        with file("scan.npz") as path, replacing(path) as npz:
-            write_npz(npz, self.arrays())
-        if self.xyz is not None and self.normals is not None and self.valid.any():
-            with file("cloud.ply") as path, replacing(path) as ply:
-                vertices = vertices_of(self.xyz, self.normals, self.albedo, self.confidence)
-                write_ply(ply, vertices, ("fringed; mm, camera frame: x right, y down, z forward",))
-        elif self.xyz is not None:
-            warnings.append("the cloud has no points: cloud.ply was not written")
-        with file("preview.png") as path:
-            replace_file(path, _png(preview_picture(self)))
+        # The picture is drawn while the arrays go to the disk; both need the normals, which are made once.
+        normals = self.normals
+        with ThreadPoolExecutor(1, thread_name_prefix="preview") as drawing:
+            picture = drawing.submit(lambda: _png(preview_picture(self)))
+            with file("scan.npz") as path, replacing(path) as npz:
+                write_npz(npz, self.arrays())
+            if self.xyz is not None and normals is not None and self.valid.any():
+                with file("cloud.ply") as path, replacing(path) as ply:
+                    vertices = vertices_of(self.xyz, normals, self.albedo, self.confidence)
+                    write_ply(ply, vertices, ("fringed; mm, camera frame: x right, y down, z forward",))
+            elif self.xyz is not None:
+                warnings.append("the cloud has no points: cloud.ply was not written")
+            with file("preview.png") as path:
+                replace_file(path, picture.result())
         if self.error_map is not None:
             with file("error_map.png") as path:
                 replace_file(path, _png(self.error_map))
