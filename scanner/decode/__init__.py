@@ -79,23 +79,33 @@ class Decoder(Protocol):
         """
 
 
+DECODERS: Mapping[str, tuple[str, ...]] = {"mcp": ("default", "casey2011")}
+"""Decoders by name, of methods that have more than the default one."""
+
+
 def decoder_for(sequence: PatternSequence, camera: CameraFormat, name: str = "default") -> Decoder:
     """The decoder for a pattern.
 
     Args:
         sequence: what was projected.
         camera: the frames' format.
-        name: "default", or a decoder of that method by name.
+        name: "default", or a decoder of that method by name: "casey2011" for MCP, the dissertation's own.
 
     Raises:
         DecodeError: no such decoder for this method.
     """
     # Imported on demand: a program that decodes PMP does not pay for MCP's kernels.
-    if name != "default":
+    method = sequence.pattern.method
+    if name not in DECODERS.get(method, ("default",)):
+        others = ", ".join(f"{known} ({of})" for of, names in DECODERS.items() for known in names if known != "default")
         raise DecodeError(
-            f"no decoder {name!r} for method {sequence.pattern.method!r}",
-            hint="leave --decoder out for the default",
+            f"no decoder {name!r} for method {method!r}",
+            hint=f"leave --decoder out for the default; there are: default (any method), {others}",
         )
+    if name == "casey2011":
+        from scanner.decode.mcp.casey2011 import CaseyDecoder  # noqa: PLC0415
+
+        return CaseyDecoder(sequence, camera)
     if isinstance(sequence.pattern, PmpPattern):
         from scanner.decode.pmp import PmpDecoder  # noqa: PLC0415
 

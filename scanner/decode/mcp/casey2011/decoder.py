@@ -1,0 +1,349 @@
+"""The reference decoder: the stages in order, and the maps they leave.
+
+The door is the default decoder's: what a frame must be, and vertical stripes (axis "x") turned into horizontal ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode import Decoded, Reason
+from scanner.decode.mcp.casey2011 import carrier_search, channels, growth, hidden_markov, inclination, stripe_detection
+from scanner.decode.mcp.decoder import McpDecoder, _door, _turned
+from scanner.decode.mcp.locate import Stages
+from scanner.decode.mcp.model import PatternModel
+from scanner.errors import DecodeError
+from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
+
+LEAST_CONTRAST = 0.01
+"""Share of the camera's range below which an image holds no pattern."""
+
+FINEST_PX = 6.0
+"""Stripes nearer than this have no region and peak of their own."""
+
+LEAST_LIT = 0.005
+"""Share of all columns' stripes that must have a peak; fewer is no pattern."""
+
+MATCH = 0.08
+"""Largest departure of the carriers found from the projected ones times one factor: slant and keystone change all by
+the same factor, another pattern does not."""
+
+BAND_CONTRAST = 2.0
+"""Least ratio of the weakest carrier's band to the spectrum around: noise and other patterns stay below 1.6, the
+reference scenes lie above 5. A segment whose own carriers stay below is read with the whole image: a small object's
+has too little of a stripe for a spectrum of its own (sphere before dark: .93 of the code words right against .52)."""
+
+AGREEMENT = 0.25
+"""Least share of code words on the peaks that the model's path keeps. A wrong order of codes keeps up to .16 of them,
+the reference scenes .67 and more."""
+
+
+class CaseyDecoder(McpDecoder):
+    """Takes the one frame of an MCP sequence and decodes it as published.
+
+    `stages` holds the named intermediate images after `finish`, stripes horizontal, like figures 5.4-5.14.
+    """
+
+    def __init__(self, sequence: PatternSequence, camera: CameraFormat) -> None:
+        super().__init__(sequence, camera)
+        self.stages: dict[str, NDArray[Any]] = {}
+
+    def finish(self) -> Decoded:
+        """The maps; see `scanner.decode.Decoder`."""
+        if self._image is None:
+            raise DecodeError("the MCP frame is missing", hint=f"it is frame {self._sequence.fringes[0]}")
+        image = self._image
+        if self._black is not None:
+            image = cv2.subtract(image, self._black)
+        return decode_image(image, self._pattern, self._sequence.projector, self._camera, self.stages)
+
+
+def decode_image(
+    image: NDArray[np.uint8] | NDArray[np.uint16],
+    pattern: McpPattern,
+    projector: ProjectorSize,
+    camera: CameraFormat,
+    stages: dict[str, NDArray[Any]] | None = None,
+) -> Decoded:
+    """Decode one image as published.
+
+    Args:
+        image: (H, W) uint8 or uint16, linear camera response, as captured.
+        pattern: what was projected.
+        projector: size of the projector's image.
+        camera: format of `image`.
+        stages: takes the intermediate images by name: input, enhanced, regions, stripes, slope; spectrum, bands
+            (A, B, C of fig. 4.9), channel_i and bits_i of each segment ("spectrum_negligible"); on the peaks, 0
+            elsewhere: code, code_modal, hmm, hmm_modal, blobs, grown (code words), all_stripes (index + 1), all_2x_4x
+            (4 index + 1); growth_mask.
+
+    Returns:
+        maps on the camera's grid, with rows on the pixels of stripe peaks, minima and mid-levels only.
+
+    Raises:
+        DecodeError: no stripes, other carriers than described, or codes that contradict the description.
+    """
+    pattern.validate(projector)
+    upright = _door(image, pattern, camera)
+    seen: dict[str, NDArray[Any]] = stages if stages is not None else {}
+    model = PatternModel.of(pattern, projector)
+    clock = Stages()
+    _refuse_flat(upright, camera)
+    with clock.stage("stripes"):
+        found = stripe_detection.detect(upright, model.stripes, model.weakest)
+        _refuse_few(found, upright)
+        seen["input"], seen["enhanced"], seen["regions"] = upright, found.enhanced, found.region
+        seen["stripes"] = found.peaks.image(found.region.shape)
+    read = _read_channels(upright, found, model, clock, seen)
+    named = _name_peaks(read.word, found, pattern, model, clock, seen)
+    with clock.stage("stripes between"):
+        light = found.calm[found.peaks.y, found.peaks.column]
+        stripe, sure = growth.name_unmodulated(named.stripe, named.sure, found.peaks, light)
+        seen["all_stripes"] = _image(stripe + 1, found)
+        marks = growth.name_2x_4x(found.calm, stripe, sure, found.peaks)
+    with clock.stage("maps"):
+        decoded = _maps(upright, found, stripe, marks, model, camera)
+    seen["all_2x_4x"] = np.zeros(upright.shape, np.int32)
+    seen["all_2x_4x"][marks.y, marks.x] = np.rint(4 * marks.index).astype(np.int32) + 1
+    details = {
+        **named.figures,
+        "pitch_px": round(found.wavelength, 3),
+        "intensity_threshold": round(found.threshold, 2),
+        "segments": [{"name": s.name, "slope": round(s.slope, 4)} for s in read.segments],
+        "carriers": [[round(float(f) * upright.shape[1], 2) for f in s.frequency] for s in read.searches],
+        "carrier_contrast": [round(s.contrast, 2) for s in read.searches],
+        "peaks": len(found.peaks.y),
+        "peaks_decided": int((stripe >= 0).sum()),
+        "marks": len(marks.x),
+        "timings_ms": {name: round(ms, 2) for name, ms in clock.ms.items()},
+    }
+    warnings = () if len(marks.x) else ("stripes and carriers are there, but no stripe could be decided",)
+    decoded = replace(decoded, details=details, warnings=warnings)
+    return decoded if pattern.axis == "y" else _turned(decoded)
+
+
+# --- no pattern ---------------------------------------------------------------------------------------------------
+
+
+def _refuse_flat(image: NDArray[Any], camera: CameraFormat) -> None:
+    low, high = (float(v) for v in np.percentile(image[::4, ::4], (1, 99)))
+    if high - low < LEAST_CONTRAST * camera.max_value:
+        raise DecodeError(
+            f"no pattern: the image is uniform (grey levels {low:.0f} to {high:.0f})",
+            hint="check that the projector shows the pattern, its focus, and the exposure",
+        )
+
+
+def _refuse_few(found: stripe_detection.Stripes, image: NDArray[Any]) -> None:
+    if found.wavelength < FINEST_PX:
+        raise DecodeError(
+            f"stripes are {found.wavelength:.1f} px apart, too fine for this camera",
+            hint="project fewer bits, or move the camera closer",
+        )
+    if len(found.peaks.y) < LEAST_LIT * image.size / found.wavelength:
+        raise DecodeError("no stripes stand out", hint="check focus, exposure and what is projected")
+
+
+def _match(search: carrier_search.Search, expected: NDArray[np.float64]) -> bool:
+    """Whether the carriers found stand out, and are the projected ones times one factor."""
+    factor = search.frequency / expected
+    clear = search.complete and search.contrast >= BAND_CONTRAST
+    return clear and bool(np.ptp(factor) <= MATCH * factor.mean())
+
+
+def _refuse_carriers(search: carrier_search.Search, expected: NDArray[np.float64], width: int) -> None:
+    if _match(search, expected):
+        return
+    wanted = ", ".join(f"{f * width:.0f}" for f in expected)
+    hint = "check carriers and axis of the description, and focus"
+    if not search.complete or search.contrast < BAND_CONTRAST:
+        raise DecodeError(f"stripes, but no carriers stand out near {wanted} cycles per image", hint=hint)
+    shown = ", ".join(f"{f * width:.0f}" for f in search.frequency)
+    raise DecodeError(f"other carriers than described: {shown} cycles per image, not near {wanted}", hint=hint)
+
+
+# --- what is on the peaks -------------------------------------------------------------------------------------------
+
+
+_SIGMA_PX = np.array([12**-0.5, 0.5, 1.0, 0.5], np.float32)
+"""Error of peaks, mid-levels, minima and mid-levels, camera px: a peak's is that of rounding to whole pixels; a minimum
+lies off by about the width of the blur, a mid-level by half of that."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """word: (P,) int32 code word on each peak; what was decoded apart, and the carriers of each."""
+
+    word: NDArray[np.int32]
+    segments: list[inclination.Segment]
+    searches: list[carrier_search.Search]
+
+
+def _read_channels(
+    image: NDArray[Any],
+    found: stripe_detection.Stripes,
+    model: PatternModel,
+    clock: Stages,
+    seen: dict[str, NDArray[Any]],
+) -> _Read:
+    """Segments, their carriers and channels; code words on the peaks (sec. 4.2-4.5)."""
+    peaks, shape, width = found.peaks, found.region.shape, image.shape[1]
+    ascending = np.argsort(model.carriers)
+    expected = model.carriers[ascending].astype(np.float64) * model.pitch / found.wavelength
+    with clock.stage("inclination"):
+        slope = inclination.slopes(peaks, found.wavelength)
+        limit = inclination.negligible_slope(found.wavelength, float(np.diff(expected).min()))
+        parts = inclination.segments(peaks, slope, limit, found.wavelength, shape)
+        number = inclination.segment_of(parts, slope, limit)
+    word = np.zeros(len(peaks.y), np.int32)
+    searches: list[carrier_search.Search] = []
+    used: list[inclination.Segment] = []
+    grey = image.astype(np.float32)
+    grey -= grey.mean()
+    for k, part in enumerate(parts):
+        with clock.stage("inclination"):
+            level = inclination.turned_level(grey, part)
+        with clock.stage("carriers"):
+            transform = carrier_search.spectrum(level)
+            folded = carrier_search.folded_psd(level, found.wavelength)
+            search = carrier_search.search(folded, expected, width)
+            if k == 0 and not _match(search, expected):
+                search = carrier_search.search(folded, expected, width, near=True)
+                _refuse_carriers(search, expected, width)
+            elif search.contrast < BAND_CONTRAST:
+                continue
+            searches.append(search)
+            used.append(part)
+        with clock.stage("channels"):
+            mask = inclination.level_mask(part)
+            bits: list[NDArray[np.uint8]] = [np.zeros(shape, np.uint8)] * model.channels
+            for i, channel in enumerate(ascending):
+                frequency, sigma = float(search.frequency[i]), float(search.sigma[i])
+                isolated = channels.isolate(transform, frequency, sigma, found.wavelength, shape)
+                binary = channels.binarize(isolated, frequency, mask)
+                bits[channel] = inclination.turned_back(binary, part)
+                seen[f"channel_{channel}_{part.name}"] = isolated
+                seen[f"bits_{channel}_{part.name}"] = bits[channel]
+            # The first segment reads all peaks; those of a segment of its own are then read again.
+            mine = number == k if k > 0 else np.ones(len(word), bool)
+            word[mine] = channels.code_words(bits, peaks.y[mine], peaks.column[mine])
+        seen[f"spectrum_{part.name}"], seen[f"bands_{part.name}"] = folded, np.stack([search.A, search.B, search.C])
+    seen["slope"] = _image(slope, found)
+    return _Read(word, used, searches)
+
+
+@dataclass(frozen=True, eq=False)
+class _Named:
+    """stripe: (P,) int32 index of modulated stripes, -1 none. sure: (P,) float32. figures for the report."""
+
+    stripe: NDArray[np.int32]
+    sure: NDArray[np.float32]
+    figures: dict[str, Any]
+
+
+def _name_peaks(
+    word: NDArray[np.int32],
+    found: stripe_detection.Stripes,
+    pattern: McpPattern,
+    model: PatternModel,
+    clock: Stages,
+    seen: dict[str, NDArray[Any]],
+) -> _Named:
+    """Hidden Markov model and what follows it, on modulated stripes (sec. 4.5, 5.2-5.4)."""
+    peaks, wavelength, shape = found.peaks, found.wavelength, found.region.shape
+    stripes = np.array([s for s in range(model.stripes) if pattern.code_of(s)], np.int32)
+    symbols = np.array([pattern.code_of(int(s)) for s in stripes], np.int32)
+    lit = int((model.level > 0).sum())
+    with clock.stage("hidden Markov model"):
+        expected = (model.ratio > 0).sum(axis=0) / lit
+        miss = channels.miss_rates(word, expected)
+        false = np.full(model.channels, channels.FALSE_POSITIVE)
+        known = hidden_markov.model(symbols, false, miss)
+        path = hidden_markov.best_paths(word, peaks.start, known)
+        sure = hidden_markov.posteriors(word, peaks.start, path, known)
+    as_word = np.concatenate(([0], symbols)).astype(np.int32)
+    agreement = float((word[word > 0] == as_word[path[word > 0]]).mean()) if (word > 0).any() else 0.0
+    if agreement < AGREEMENT:
+        raise DecodeError(
+            f"stripes and carriers are there, but the codes contradict the description ({agreement:.0%} of them fit)",
+            hint="check bits, carriers, codes and axis of the description against what is projected",
+        )
+    with clock.stage("modal filter"):
+        modal = growth.modal_filter(path, peaks, wavelength)
+        seen["code_modal"] = _image(growth.modal_filter(word, peaks, wavelength), found)
+    with clock.stage("blobs"):
+        period = wavelength / (model.pitch * float(model.carriers.min()))
+        beat = wavelength / (model.pitch * model.separation)
+        solid = growth.eliminate_blobs(modal, peaks, shape, wavelength, round(period), round(beat / 2))
+    with clock.stage("growth"):
+        grown, mask = growth.grow(solid, peaks, found.region, wavelength)
+    seen["code"] = _image(word, found)
+    for name, label in (("hmm", path), ("hmm_modal", modal), ("blobs", solid), ("grown", grown)):
+        seen[name] = _image(as_word[label], found)
+    seen["growth_mask"] = mask
+    own = (grown == path) & (path > 0)
+    usual = float(sure[own].mean()) if own.any() else 0.0
+    sure = np.where(own, sure, np.where(grown > 0, usual, 0)).astype(np.float32)
+    index = np.concatenate(([-1], stripes)).astype(np.int32)[grown]
+    figures = {"miss_rates": [round(float(m), 4) for m in miss], "agreement": round(agreement, 4)}
+    return _Named(index, sure, figures)
+
+
+# --- maps -----------------------------------------------------------------------------------------------------------
+
+
+def _maps(
+    image: NDArray[Any],
+    found: stripe_detection.Stripes,
+    stripe: NDArray[np.int32],
+    marks: growth.Marks,
+    model: PatternModel,
+    camera: CameraFormat,
+) -> Decoded:
+    """Maps with values on the marks; albedo and modulation over one stripe around every pixel."""
+    shape = found.region.shape
+    high = 2 * round(found.wavelength / 2) + 1
+    at = marks.y, marks.x
+    rows = np.full(shape, np.nan, np.float32)
+    # The code-to-phase fit of sec. 3.7 as the pattern itself gives it (slope h, intercept h / 2 - 0.5).
+    row = ((marks.index + 0.5) * model.pitch - 0.5).astype(np.float32)
+    rows[at] = row
+    sigma = np.full(shape, np.nan, np.float32)
+    sigma[at] = np.float32(model.pitch / found.wavelength) * _SIGMA_PX[np.rint(4 * (marks.index % 1)).astype(np.intp)]
+    confidence = np.zeros(shape, np.float32)
+    confidence[at] = marks.confidence
+    upper = cv2.dilate(image, np.ones((high, 1), np.uint8)).astype(np.float32)
+    lower = cv2.erode(image, np.ones((high, 1), np.uint8)).astype(np.float32)
+    albedo = cv2.boxFilter(image, cv2.CV_32F, (1, high))
+    named = np.full(shape, -1, np.int16)
+    peaks = found.peaks
+    named[peaks.y, peaks.column] = stripe
+    reason = np.where(upper > found.threshold, np.uint8(Reason.BORDER), np.uint8(Reason.SHADOW))
+    reason[peaks.y, peaks.column] = Reason.UNWRAP_RISK
+    reason[image >= camera.max_value] = Reason.CLIPPED
+    reason[at] = Reason.VALUE
+    listed = np.stack([marks.x, marks.y, row, marks.index, marks.confidence], axis=1).astype(np.float32)
+    return Decoded(
+        rows=rows,
+        columns=None,
+        sigma_rows=sigma,
+        sigma_columns=None,
+        confidence=confidence,
+        albedo=np.asarray(albedo, np.float32),
+        modulation=np.asarray(upper - lower, np.float32),
+        reason=reason,
+        stripes=named,
+        peaks=listed,
+    )
+
+
+def _image(value: NDArray[Any], found: stripe_detection.Stripes) -> NDArray[Any]:
+    """Values of the peaks as an image, zero elsewhere."""
+    image = np.zeros(found.region.shape, value.dtype)
+    image[found.peaks.y, found.peaks.column] = value
+    return image
