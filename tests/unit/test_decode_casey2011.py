@@ -143,6 +143,16 @@ def test_analysis_by_synthesis_finds_the_bands_and_their_widths():
         assert found.contrast > 2
 
 
+def test_prior_knowledge_is_all_carriers_times_one_factor():
+    lines = np.array([80.0, 100.0, 125.0, 140.0])
+    A = 0.01 + np.exp(-((np.arange(300) - 1.12 * lines[:, None]) ** 2) / 18).sum(axis=0)
+    assert carrier_search.common_factor(A, lines) == pytest.approx(1.12, abs=0.01)
+    # Texture outshines the weakest carrier: only the prior tells which band is none.
+    textured = A - 0.7 * np.exp(-((np.arange(300) - 1.12 * 125) ** 2) / 18) + np.exp(-((np.arange(300) - 122) ** 2) / 8)
+    found = carrier_search.search(np.float32(textured[None, :]), lines / 598, 598, near=True)
+    np.testing.assert_allclose(found.frequency * 598, 1.12 * lines, atol=1.5)
+
+
 def test_noise_has_no_bands():
     noise = np.random.default_rng(2).normal(0, 1, (256, 400)).astype(np.float32)
     folded = carrier_search.folded_psd(noise, 16.0)

@@ -31,13 +31,17 @@ WIDEST = 1 / 3
 """Largest sigma of a band, in spacings: a Gaussian then lets through 1 % of its neighbour's middle."""
 
 
+FLOOR_PERCENTILE = 10
+"""Of A between the lowest and the highest carrier: the level between bands, even where they fill nine tenths."""
+
+
 @dataclass(frozen=True, eq=False)
 class Search:
     """Carriers found, lowest first, and the arrays of fig. 4.9.
 
     frequency: (N,) float64, cycles per px along x. sigma: (N,) float64, of the Gaussian found. strength: (N,) M.
     A, B, C, D: (W // 2 + 1,) float64.
-    contrast: the weakest band found over the median of A where carriers were sought.
+    contrast: the weakest band found over the low end of A where carriers were sought.
     complete: False where fewer bands than carriers were found; all are then where the projected ones predict.
     """
 
@@ -82,8 +86,9 @@ def search(folded: Array, expected: NDArray[np.float64], width: int, near: bool 
         folded: `folded_psd`.
         expected: (N,) cycles per px at the scale of the stripes, ascending.
         width: of the image, px.
-        near: seek each carrier within half a spacing of where it is expected, instead of all between the lowest and
-            the highest: the dissertation's enhancement by prior knowledge, for surfaces with a texture of their own.
+        near: seek each carrier within half a spacing of where it is expected times the one factor at which all stand
+            out best, instead of all between the lowest and the highest: the dissertation's enhancement by prior
+            knowledge, for surfaces with a texture of their own.
     """
     A = cv2.GaussianBlur(folded.sum(axis=0, dtype=np.float64)[None, :], (0, 0), 1.0).ravel()
     D = second_derivative(A)
@@ -94,7 +99,9 @@ def search(folded: Array, expected: NDArray[np.float64], width: int, near: bool 
     high = min(int((1 + TOLERANCE) * expected[-1] * width), len(A) - 2)
     found: list[tuple[float, float, float]] = []
     allowed = (bins >= low) & (bins <= high)
-    windows = np.abs(bins - expected[:, None] * width) <= spacing / 2
+    windows = (
+        np.abs(bins - (common_factor(A, expected * width) if near else 1.0) * expected[:, None] * width) <= spacing / 2
+    )
     if near:
         allowed &= windows.any(axis=0)
     C = A.copy()
@@ -119,9 +126,16 @@ def search(folded: Array, expected: NDArray[np.float64], width: int, near: bool 
     found.sort()
     columns = np.array(found)
     sigma = np.clip(columns[:, 1], NARROWEST * spacing, WIDEST * spacing)
-    floor = float(np.median(A[low : high + 1])) if high > low else 0.0
+    floor = float(np.percentile(A[low : high + 1], FLOOR_PERCENTILE)) if high > low else 0.0
     contrast = float(columns[:, 2].min()) / floor if floor > 0 else 0.0
     return Search(columns[:, 0] / width, sigma / width, columns[:, 2], A, B, C, D, contrast, complete)
+
+
+def common_factor(A: NDArray[np.float64], lines: NDArray[np.float64]) -> float:
+    """The factor, 1 -+ TOLERANCE, at which A is largest on all `lines` (N,) together, by the mean of logarithms."""
+    factors = np.arange(1 - TOLERANCE, 1 + TOLERANCE, 0.5 / lines[-1])
+    at = np.clip(np.rint(factors[:, None] * lines).astype(np.intp), 0, len(A) - 1)
+    return float(factors[np.argmax(np.log(np.maximum(A[at], 1e-12 * A.max() + 1e-30)).sum(axis=1))])
 
 
 def second_derivative(A: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -29,18 +29,17 @@ FINEST_PX = 6.0
 LEAST_LIT = 0.005
 """Share of all columns' stripes that must have a peak; fewer is no pattern."""
 
-MATCH = 0.08
-"""Largest departure of the carriers found from the projected ones times one factor: slant and keystone change all by
-the same factor, another pattern does not."""
+MATCH = 0.15
+"""Largest spread of the carriers found over the projected ones: slant and keystone change all by about one factor,
+which another set of carriers does not show. As much may part a segment's carriers from those of the whole image."""
 
-BAND_CONTRAST = 2.0
-"""Least ratio of the weakest carrier's band to the spectrum around: noise and other patterns stay below 1.6, the
-reference scenes lie above 5. A segment whose own carriers stay below is read with the whole image: a small object's
-has too little of a stripe for a spectrum of its own (sphere before dark: .93 of the code words right against .52)."""
+BAND_CONTRAST = 4.0
+"""Least ratio of the weakest carrier's band to what lies between bands: noise and other patterns stay below 2, the
+reference scenes lie above 15."""
 
 AGREEMENT = 0.25
 """Least share of code words on the peaks that the model's path keeps. A wrong order of codes keeps up to .16 of them,
-the reference scenes .67 and more."""
+the reference scenes .41 and more."""
 
 
 class CaseyDecoder(McpDecoder):
@@ -150,7 +149,7 @@ def _refuse_few(found: stripe_detection.Stripes, image: NDArray[Any]) -> None:
 
 
 def _match(search: carrier_search.Search, expected: NDArray[np.float64]) -> bool:
-    """Whether the carriers found stand out, and are the projected ones times one factor."""
+    """Whether the carriers found stand out, and are the expected ones times one factor."""
     factor = search.frequency / expected
     clear = search.complete and search.contrast >= BAND_CONTRAST
     return clear and bool(np.ptp(factor) <= MATCH * factor.mean())
@@ -215,7 +214,9 @@ def _read_channels(
             if k == 0 and not _match(search, expected):
                 search = carrier_search.search(folded, expected, width, near=True)
                 _refuse_carriers(search, expected, width)
-            elif search.contrast < BAND_CONTRAST:
+            alike = k == 0 or np.allclose(search.frequency, searches[0].frequency, rtol=MATCH)
+            if not (alike and _match(search, expected)):
+                # Too little of a stripe for a spectrum of its own (a small object): better read in the whole image.
                 continue
             searches.append(search)
             used.append(part)
