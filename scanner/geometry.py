@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 FORMAT = "fringed-calibration"
 VERSION = 1
 
+MOST_DISTORTION = 2.5
+"""Factor by which distortion may move the middle of an image's edge towards or away from the centre."""
+
 
 @dataclass(frozen=True, eq=False)
 class Lens:
@@ -140,7 +143,7 @@ def load_calibration(path: Path) -> Calibration:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise CalibrationError(f"cannot read calibration {path}: {error.strerror}") from error
-    except (ValueError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise CalibrationError(f"{path} is not JSON: {error}") from error
     return calibration_from_dict(content, name=str(path))
 
@@ -154,11 +157,14 @@ def calibration_from_dict(content: Any, name: str = "calibration") -> Calibratio
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CalibrationError(f"{name}: not a {FORMAT} file", hint='its "format" member says what a file is')
     version = content.get("version")
-    if version != VERSION:
+    if version != VERSION or version is True:
         raise CalibrationError(
             f"{name}: version {version!r} of {FORMAT}, this program reads version {VERSION}",
             hint="update fringed, or write the file again with this one",
         )
+    if content.get("units", "mm") != "mm":
+        raise CalibrationError(f"{name}: units are {content['units']!r:.80}, lengths must be in mm")
+    _check_optional(content, name)
     lenses = {side: _lens(content.get(side), f"{name}: {side}") for side in ("camera", "projector")}
     rotation = _matrix(content.get("rotation"), (3, 3), f"{name}: rotation")
     translation = _matrix(content.get("translation"), (3,), f"{name}: translation")
@@ -245,7 +251,53 @@ def _lens(content: Any, name: str) -> Lens:
     if np.abs(matrix[1, 0]) > 0 or np.abs(matrix[2] - (0, 0, 1)).max() > 0:
         raise CalibrationError(f"{name}.matrix must be upper triangular with last row 0 0 1")
     distortion = _matrix(content.get("distortion", [0.0] * 5), (5,), f"{name}.distortion")
-    return Lens((size[0], size[1]), matrix, distortion)
+    lens = Lens((size[0], size[1]), matrix, distortion)
+    _check_distortion(lens, name)
+    return lens
+
+
+def _check_distortion(lens: Lens, name: str) -> None:
+    """Raise CalibrationError where the image's edges lie beyond the distortion's fold or are moved absurdly far."""
+    width, height = lens.size
+    middles = np.array(
+        [(0, (height - 1) / 2), (width - 1, (height - 1) / 2), ((width - 1) / 2, 0), ((width - 1) / 2, height - 1)]
+    )
+    seen = Lens(lens.size, lens.matrix, np.zeros(5)).normalised(middles)
+    true = lens.normalised(middles)
+    share = np.linalg.norm(true, axis=1) / np.maximum(np.linalg.norm(seen, axis=1), 1e-9)
+    # Written so that NaN, beyond the fold, fails too. A lens of 120 degrees moves its edges by half their radius.
+    if not np.all((share > 1 / MOST_DISTORTION) & (share < MOST_DISTORTION)):
+        raise CalibrationError(
+            f"{name}.distortion {lens.distortion.tolist()} folds the image or moves its edges too far",
+            hint="calibrate again with fewer radial terms, or with targets out to the image's edges",
+        )
+
+
+def _check_optional(content: Mapping[str, Any], name: str) -> None:
+    """Raise CalibrationError where an optional member that this program may use is there and malformed."""
+    shapes: dict[str, dict[str, tuple[int, ...]]] = {
+        "hall": {"camera": (3, 4), "projector": (3, 4)},
+        "world": {"rotation": (3, 3), "translation": (3,)},
+    }
+    for key, members in shapes.items():
+        member = content.get(key)
+        if member is None:
+            continue
+        if not isinstance(member, dict):
+            raise CalibrationError(f"{name}: {key} must be null or an object, got {member!r:.80}")
+        for part, shape in members.items():
+            _matrix(member.get(part), shape, f"{name}: {key}.{part}")
+    phase = content.get("mcp_phase")
+    if phase is not None:
+        if not isinstance(phase, dict):
+            raise CalibrationError(f"{name}: mcp_phase must be null or an object, got {phase!r:.80}")
+        for part in ("slope", "intercept"):
+            _matrix(phase.get(part), (), f"{name}: mcp_phase.{part}")
+    response = content.get("response")
+    if response is not None and not (
+        isinstance(response, dict) and all(side is None or isinstance(side, dict) for side in response.values())
+    ):
+        raise CalibrationError(f"{name}: response must be null or an object of sides, got {response!r:.80}")
 
 
 def _matrix(content: Any, shape: tuple[int, ...], name: str) -> Array:
@@ -253,7 +305,7 @@ def _matrix(content: Any, shape: tuple[int, ...], name: str) -> Array:
         raise CalibrationError(f"{name} is missing")
     try:
         array = np.asarray(content, dtype=np.float64)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise CalibrationError(f"{name} is not an array of numbers") from error
     if array.shape != shape:
         raise CalibrationError(f"{name} has shape {array.shape}, expected {shape}")

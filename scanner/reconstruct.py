@@ -66,13 +66,8 @@ class Reconstruction:
 
     def __init__(self, header: CaptureHeader, calibration: Calibration | None, options: DecodeOptions) -> None:
         """Raise DecodeError or CalibrationError at once where these frames cannot become a scan."""
-        if calibration is not None and calibration.camera.size != (header.camera.width, header.camera.height):
-            width, height = calibration.camera.size
-            raise CalibrationError(
-                f"the calibration is for a camera of {width} x {height}, "
-                f"the frames are {header.camera.width} x {header.camera.height}",
-                hint="use the calibration made with this camera and region",
-            )
+        if calibration is not None:
+            _require_sizes(header, calibration)
         self._header = header
         self._calibration = calibration
         self._options = options
@@ -178,6 +173,20 @@ def reconstruct(
     for pattern, record in capture.records.items():
         reconstruction.add(pattern, capture.frame(pattern), record.slot)
     return reconstruction.finish(capture, progress)
+
+
+def _require_sizes(header: CaptureHeader, calibration: Calibration) -> None:
+    projector = header.sequence.projector
+    for name, calibrated, here, hint in (
+        ("camera", calibration.camera.size, header.camera.shape[::-1], "made with this camera and region"),
+        ("projector", calibration.projector.size, (projector.width, projector.height), "made with this projector"),
+    ):
+        if calibrated != here:
+            raise CalibrationError(
+                f"the calibration is for a {name} of {calibrated[0]} x {calibrated[1]}, "
+                f"the capture is of one of {here[0]} x {here[1]}",
+                hint=f"use the calibration {hint}",
+            )
 
 
 def ambiguity_px(sequence: PatternSequence) -> float | None:

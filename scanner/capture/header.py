@@ -21,6 +21,10 @@ FRAMES_FILE = "frames.npy"
 RECORDS_FILE = "frames.jsonl"
 
 NPY_HEADER_BYTES = 128
+MAX_REPEAT = 100_000
+MOSAICS = ("RGGB", "GRBG", "GBRG", "BGGR")
+"""Colours of the first two rows' first two pixels."""
+
 MAX_PIXELS = 1 << 28
 """Larger frames are refused before anything is read: no camera has them."""
 
@@ -85,6 +89,9 @@ class FrameRecord:
         """
         exposure, flip = line.get("exposure"), line.get("flip")
         slot, status = line["slot"], line.get("status", "ok")
+        xxh3 = line.get("xxh3")
+        if xxh3 is not None and not isinstance(xxh3, str):
+            raise ValueError("not a frame record")
         if status not in ("ok", "incomplete", "missing") or line["pattern"] < 0 or (slot is not None and slot < 0):
             raise ValueError("not a frame record")
         return cls(
@@ -92,7 +99,7 @@ class FrameRecord:
             pattern=int(line["pattern"]),
             attempt=int(line.get("attempt", 0)),
             status=status,
-            xxh3=line.get("xxh3"),
+            xxh3=xxh3,
             frame_id=line.get("frame_id"),
             trigger=line.get("trigger"),
             exposure=exposure
@@ -164,7 +171,7 @@ class CaptureHeader:
         """
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise DecodeError(f"{name}: not a {FORMAT} file", hint='its "format" member says what a file is')
-        if content.get("version") != VERSION:
+        if content.get("version") != VERSION or content["version"] is True:
             raise DecodeError(
                 f"{name}: version {content.get('version')!r} of {FORMAT}, this program reads version {VERSION}",
                 hint="update fringed",
@@ -176,8 +183,16 @@ class CaptureHeader:
         if isinstance(bits, bool) or not isinstance(bits, int) or not 1 <= bits <= 16:
             raise DecodeError(f"{name}: camera.bits must be 1 .. 16, got {bits!r}")
         repeat = content.get("repeat", 1)
-        if isinstance(repeat, bool) or not isinstance(repeat, int) or repeat < 1:
-            raise DecodeError(f"{name}: repeat must be a positive integer, got {repeat!r}")
+        if isinstance(repeat, bool) or not isinstance(repeat, int) or not 1 <= repeat <= MAX_REPEAT:
+            raise DecodeError(f"{name}: repeat must be an integer in 1 .. {MAX_REPEAT}, got {repeat!r:.80}")
+        mosaic = camera.get("mosaic")
+        if mosaic is not None and mosaic not in MOSAICS:
+            raise DecodeError(f"{name}: camera.mosaic must be null or one of {', '.join(MOSAICS)}, got {mosaic!r:.80}")
+        calibration, witnesses = content.get("calibration"), content.get("witnesses") or []
+        if calibration is not None and not isinstance(calibration, str):
+            raise DecodeError(f"{name}: calibration must be a file name or an id, got {calibration!r:.80}")
+        if not isinstance(witnesses, list) or not all(isinstance(witness, dict) for witness in witnesses):
+            raise DecodeError(f"{name}: witnesses must be a list of objects")
         frames = content.get("frames")
         if frames is not None and not (isinstance(frames, list) and all(isinstance(f, str) for f in frames)):
             raise DecodeError(f"{name}: frames must be a list of file names")
@@ -191,15 +206,15 @@ class CaptureHeader:
         known = set(cls(sequence, CameraFormat(width, height)).as_dict()) | {"frames"}
         return cls(
             sequence=sequence,
-            camera=CameraFormat(width, height, bits, camera.get("mosaic")),
+            camera=CameraFormat(width, height, bits, mosaic),
             id=str(content.get("id", "")),
             created=str(content.get("created", "")),
             repeat=repeat,
-            calibration=content.get("calibration"),
+            calibration=calibration,
             state=state,
             reason=content.get("reason"),
             plan=content.get("plan"),
-            witnesses=tuple(content.get("witnesses") or ()),
+            witnesses=tuple(witnesses),
             frames=None if frames is None else tuple(frames),
             extra={key: value for key, value in content.items() if key not in known},
         )

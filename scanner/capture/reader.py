@@ -53,7 +53,7 @@ class Capture:
             raise DecodeError(
                 f"cannot read {file}: {error.strerror}", hint="give a capture folder or its capture.json"
             ) from error
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise DecodeError(f"{file} is not JSON: {error}") from error
         header = CaptureHeader.from_dict(content, str(file))
         records = _read_records(file.parent / RECORDS_FILE) if header.frames is None else None
@@ -92,7 +92,7 @@ class Capture:
         if slot is None or self._slots is None:
             raise KeyError(pattern)
         frame: Pixels = self._slots[slot]
-        return frame
+        return _within_range(frame, self.header.camera, f"{self.path / FRAMES_FILE}, slot {slot}")
 
     def _present(self, records: Sequence[FrameRecord] | None) -> dict[int, FrameRecord]:
         count = self.header.frame_count
@@ -136,7 +136,7 @@ def _read_records(path: Path) -> list[FrameRecord] | None:
     for line in content.split(b"\n")[:-1]:
         try:
             records.append(FrameRecord.from_dict(json.loads(line)))
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
             continue
     return records
 
@@ -174,9 +174,16 @@ def _read_npy_header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
             read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
             shape, fortran, dtype = read(file)
             offset = file.tell()
-    except (OSError, ValueError) as error:
+    except Exception as error:  # a header is Python text: NumPy's reader fails on bad ones in a dozen ways
         raise DecodeError(f"{path} is not a NumPy array file: {error}") from error
-    if fortran or len(shape) != 3 or dtype not in (np.uint8, np.uint16) or shape[1] * shape[2] > MAX_PIXELS:
+    whole = all(type(n) is int and n >= 0 for n in shape)
+    if (
+        not whole
+        or fortran
+        or len(shape) != 3
+        or dtype not in (np.uint8, np.uint16)
+        or shape[1] * shape[2] > MAX_PIXELS
+    ):
         raise DecodeError(f"{path}: expected uint8 or uint16 of shape (slots, height, width), found {dtype} {shape}")
     return shape, dtype, offset
 
@@ -184,8 +191,10 @@ def _read_npy_header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
 def _read_image(path: Path, camera: CameraFormat) -> Pixels:
     if not path.is_file():
         raise DecodeError(f"frame {path} is missing")
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None:
+    content = path.read_bytes()
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
+    # OpenCV fills a JPEG that breaks off with grey and says nothing.
+    if image is None or (content[:2] == b"\xff\xd8" and b"\xff\xd9" not in content[-64:]):
         raise DecodeError(f"frame {path} cannot be read as an image", hint="PNG, TIFF, PGM or BMP, 8 or 16 bit")
     if image.ndim == 3:
         image = image[..., 0] if image.shape[2] == 1 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
@@ -195,11 +204,24 @@ def _read_image(path: Path, camera: CameraFormat) -> Pixels:
         )
     if image.dtype != camera.dtype:
         raise DecodeError(f"frame {path} is {image.dtype}, {camera.bits} bits need {camera.dtype}")
-    return np.asarray(image, dtype=camera.dtype)
+    return _within_range(np.asarray(image, dtype=camera.dtype), camera, str(path))
+
+
+def _within_range(frame: Pixels, camera: CameraFormat, name: str) -> Pixels:
+    if camera.bits not in (8, 16) and int(frame.max()) > camera.max_value:
+        raise DecodeError(
+            f"{name}: grey level {int(frame.max())} in a frame of {camera.bits} bits",
+            hint="samples are right-aligned: say the right camera.bits, or shift them down",
+        )
+    return frame
 
 
 def _inside(folder: Path, name: str) -> Path:
-    path = (folder / name).resolve()
+    try:
+        path = (folder / name).resolve()
+        path.exists()
+    except (OSError, ValueError, RuntimeError) as error:
+        raise DecodeError(f"{folder}: {name!r:.80} is no file name: {error!s:.80}") from error
     if not path.is_relative_to(folder.resolve()):
         raise DecodeError(
             f"{folder}: {name!r} leads out of the capture folder", hint="paths are relative to the folder"

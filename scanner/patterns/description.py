@@ -140,6 +140,7 @@ def _sequence(description: Mapping[str, Any], key: str) -> list[Any]:
 
 
 def _finite(value: Any, key: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise DecodeError(f'pattern member "{key}" must be a finite number, got {value!r}')
+    # Integers of JSON have no bound; floats have.
+    if isinstance(value, bool) or not isinstance(value, int | float) or not -1e300 < value < 1e300:
+        raise DecodeError(f'pattern member "{key}" must be a finite number, got {value!r:.80}')
     return float(value)

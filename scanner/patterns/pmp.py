@@ -26,6 +26,13 @@ from scanner.patterns.description import (
 MEAN = 0.5
 AMPLITUDE = 0.48
 
+MIN_FREQUENCY, MAX_FREQUENCY = 0.01, 1e5
+"""Cycles over the projector: a hundredth of a cycle has no phase to measure, and no projector is so wide."""
+
+MAX_SHIFTS = 1000
+MAX_OFFSET = 1e6
+"""Radians, and pixels: beyond this float arithmetic has no phase left."""
+
 
 @dataclass(frozen=True)
 class FringeSet:
@@ -55,10 +62,23 @@ class PmpPattern:
             raise DecodeError(
                 f"{len(self.frequencies)} frequencies and {len(self.shifts)} shifts: give one number of shifts for each"
             )
-        if any(f <= 0 for f in self.frequencies):
-            raise DecodeError(f"frequencies must be positive, got {list(self.frequencies)}")
+        if any(not MIN_FREQUENCY <= f <= MAX_FREQUENCY for f in self.frequencies):
+            raise DecodeError(
+                f"frequencies must lie in {MIN_FREQUENCY:g} .. {MAX_FREQUENCY:g}, got {list(self.frequencies)}"
+            )
+        if len(set(self.frequencies)) != len(self.frequencies):
+            raise DecodeError(
+                f"a frequency is listed twice: {list(self.frequencies)}",
+                hint="two sets of one frequency tell nothing more than one set of more shifts",
+            )
         if any(n < 3 for n in self.shifts):
             raise DecodeError(f"three shifts or more are needed for a phase, got {list(self.shifts)}")
+        if any(n > MAX_SHIFTS for n in self.shifts):
+            raise DecodeError(f"more than {MAX_SHIFTS} shifts: {list(self.shifts)}")
+        if not (abs(self.offset) <= MAX_OFFSET and abs(self.origin) <= MAX_OFFSET):
+            raise DecodeError(
+                f"offset and origin must lie within +-{MAX_OFFSET:g}, got {self.offset:g}, {self.origin:g}"
+            )
         if self.sign not in (-1, 1):
             raise DecodeError(f'pattern member "sign" must be 1 or -1, got {self.sign!r}')
 

@@ -80,6 +80,8 @@ class PatternSequence:
             raise DecodeError("white, black, sentinels and bars must be different positions")
         if any(not 0 <= position < len(self) for position in special):
             raise DecodeError(f"white, black, sentinels and bars must be positions in 0 .. {len(self) - 1}")
+        if strange := set(self.bars) - set(getattr(self.pattern, "axes", ())):
+            raise DecodeError(f"order bars along {', '.join(sorted(strange))}: the pattern does not measure that axis")
         if self.sentinels and len(self.sentinels) != len(SENTINELS_BEFORE + SENTINELS_AFTER):
             raise DecodeError(f"a bracketed sequence has 6 sentinels, got {len(self.sentinels)}")
 

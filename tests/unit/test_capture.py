@@ -210,14 +210,60 @@ def test_a_bad_image_is_named(tmp_path: Path, spoil: object, says: str) -> None:
         ({"pattern": {"method": "pmp", "axes": ["y"], "frequencies": [1, 2], "shifts": [3]}}, "shifts"),
         ({"state": "maybe"}, "state"),
         ({"repeat": 0}, "repeat"),
+        ({"repeat": 10**12}, "repeat"),
+        ({"version": True}, "version True"),
+        ({"calibration": 5}, "calibration must be"),
+        ({"witnesses": 5}, "witnesses must be"),
+        ({"frames": ["0.png", "1" * 5000, "2.png"]}, "is no file name"),
+        ({"frames": ["0.png", "\0", "2.png"]}, "is no file name"),
+        ({"camera": {"width": 20, "height": 10, "bits": 8, "mosaic": "purple"}}, "mosaic"),
+        ({"camera": {"width": 20, "height": 10, "bits": 7}}, "frame of 7 bits"),
     ],
 )
 def test_a_bad_header_is_refused_with_its_file(tmp_path: Path, changes: dict[str, object], says: str) -> None:
     names = write_images(tmp_path / "c", [frame(0), frame(1), frame(2)])
     folder = image_capture(tmp_path / "c", names, **changes)
     with pytest.raises(DecodeError, match=says) as error:
-        Capture.open(folder).frame(0)
+        _ = [Capture.open(folder).frame(pattern) for pattern in range(3)]
     assert str(folder) in str(error.value)
+
+
+def test_a_jpeg_that_breaks_off_is_not_taken_for_a_frame(tmp_path: Path) -> None:
+    whole = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (10, 20), np.uint8))[1].tobytes()
+    for content, fine in ((whole, True), (whole[: len(whole) // 2], False)):
+        names = write_images(tmp_path / "c", [frame(0), frame(1), frame(2)])
+        (tmp_path / "c" / "1.png").write_bytes(content)
+        capture = Capture.open(image_capture(tmp_path / "c", names))
+        if fine:
+            assert capture.frame(1).shape == (10, 20)
+        else:
+            with pytest.raises(DecodeError, match="cannot be read"):
+                capture.frame(1)
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["[]", "5", "null", "[" * 200_000, '{"slot": Infinity, "pattern": 1}', '{"slot": 1, "pattern": 1, "xxh3": 5}'],
+)
+def test_a_line_that_is_no_record_says_nothing(tmp_path: Path, line: str) -> None:
+    writer = CaptureWriter(tmp_path / "c", header(), len(SEQUENCE))
+    write_frames(writer, range(3))
+    writer.close("complete")
+    with (tmp_path / "c" / "frames.jsonl").open("a") as file:
+        file.write(line + "\n")
+    assert sorted(Capture.open(tmp_path / "c").records) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("shape", ["(-3, 10, 20)", "(True, 10, 20)", "((((", "(3, 10, 20" + "(" * 50])
+def test_a_damaged_array_header_is_refused(tmp_path: Path, shape: str) -> None:
+    folder = image_capture(tmp_path / "c", [])
+    content = json.loads((folder / "capture.json").read_text())
+    del content["frames"]
+    (folder / "capture.json").write_text(json.dumps(content))
+    body = f"{{'descr': '|u1', 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode() + b"\n"
+    (folder / "frames.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(body).to_bytes(2, "little") + body + bytes(600))
+    with pytest.raises(DecodeError, match=r"frames\.npy"):
+        Capture.open(folder)
 
 
 def test_truncated_frames_are_refused(tmp_path: Path) -> None:

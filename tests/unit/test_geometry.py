@@ -88,6 +88,14 @@ def test_a_calibration_survives_its_file(rig_of, tmp_path):
         (lambda c: c["rotation"][0].__setitem__(0, -c["rotation"][0][0]), "not a rotation"),
         (lambda c: c.update(translation=[0, 0, 0]), "translation is zero"),
         (lambda c: c.update(translation=["a", 0, 0]), "not an array of numbers"),
+        (lambda c: c.update(translation=[10**400, 0, 0]), "not an array of numbers"),
+        (lambda c: c.update(units="m"), "units"),
+        (lambda c: c["camera"].update(distortion=[1e9] * 5), "folds the image"),
+        (lambda c: c["camera"].update(distortion=[-50.0, 0, 0, 0, 0]), "folds the image"),
+        (lambda c: c.update(hall={"camera": [[1]], "projector": [[1]]}), r"hall\.camera has shape"),
+        (lambda c: c.update(world=5), "world must be"),
+        (lambda c: c.update(mcp_phase={"slope": 1.0}), r"mcp_phase\.intercept is missing"),
+        (lambda c: c.update(response=[2.3]), "response must be"),
     ],
 )
 def test_what_is_no_calibration_is_refused_and_named(rig_of, change, says):

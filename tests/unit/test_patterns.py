@@ -176,7 +176,7 @@ FREQUENCY = st.one_of(st.integers(1, 24).map(float), st.floats(0.1, 24, allow_na
 @st.composite
 def pmp_patterns(draw):
     count = draw(st.integers(1, 4))
-    frequencies = tuple(draw(st.lists(FREQUENCY, min_size=count, max_size=count)))
+    frequencies = tuple(draw(st.lists(FREQUENCY, min_size=count, max_size=count, unique=True)))
     shifts = tuple(draw(st.lists(st.integers(3, 16), min_size=count, max_size=count)))
     offset, origin = (draw(st.floats(-4, 4, allow_nan=False)) for _ in range(2))
     return PmpPattern(draw(AXES), frequencies, shifts, draw(st.sampled_from([-1, 1])), offset, origin)
@@ -252,7 +252,11 @@ BAD = [
     ({**PMP, "frequencies": [1, "8"]}, '"frequencies"'),
     ({**PMP, "frequencies": [1, math.nan]}, '"frequencies"'),
     ({**PMP, "frequencies": [1, math.inf]}, '"frequencies"'),
-    ({**PMP, "frequencies": [0, 8]}, "positive"),
+    ({**PMP, "frequencies": [0, 8]}, "must lie in"),
+    ({**PMP, "frequencies": [1, 10**400]}, "finite number"),
+    ({**PMP, "frequencies": [8, 8]}, "listed twice"),
+    ({**PMP, "shifts": [3, 10**9]}, "more than 1000 shifts"),
+    ({**PMP, "origin": 1e9}, "offset and origin"),
     ({**PMP, "frequencies": [1, 8, 64]}, "3 frequencies and 2 shifts"),
     ({**PMP, "frequencies": [1, 30]}, "2.40 projector pixels"),
     ({**PMP, "shifts": [4, 2]}, "three shifts"),
