@@ -215,7 +215,8 @@ def _undistort(x: Array, y: Array, k: tuple[float, ...]) -> None:
                 du, dv, determinant = _distortion_step(u, v, xt[i], yt[i], k)
                 u, v = u + du, v + dv
             xs[i], ys[i] = u, v
-            last[i] = du * du + dv * dv if determinant > 0.0 else np.inf
+            near_side = determinant > 0.0 and u * xt[i] + v * yt[i] >= 0.0
+            last[i] = du * du + dv * dv if near_side else np.inf
         for i in range(n):
             if last[i] < 1e-14:  # quadratic convergence: what is left is the last step's square, at most 1e-14
                 xt[i], yt[i] = xs[i], ys[i]
@@ -230,8 +231,8 @@ def _distortion_undone(xt: float, yt: float, k: tuple[float, ...]) -> tuple[floa
     for _ in range(50):
         dx, dy, determinant = _distortion_step(x, y, xt, yt, k)
         x, y = x + dx, y + dy
-        if math.hypot(dx, dy) < 1e-12 and determinant > 0.0:
-            return x, y
+        if math.hypot(dx, dy) < 1e-12 and determinant > 0.0 and x * xt + y * yt >= 0.0:
+            return x, y  # across the centre lies another solution of a strong negative k: no light comes from there
     return np.nan, np.nan
 
 
