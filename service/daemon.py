@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +33,6 @@ from scanner.wire import (
     decode_request,
     encode,
     error_body,
-    ipc_path,
     request_id,
     sibling,
 )
@@ -43,7 +42,7 @@ from service.devices_link import DevicesLink
 from service.jobs import JobStore
 from service.logs import start_logging
 from service.pipeline import Pipeline
-from service.sockets import bound, refuse_taken, send_now
+from service.sockets import bound, refuse_files, refuse_taken, remove_sockets, send_now
 from service.spool import Limits, Spool
 from service.worker_pool import WorkerPool
 
@@ -85,8 +84,12 @@ class Daemon:
             ConfigError: another daemon is at work on the same state, or an endpoint makes no sense.
             StorageError: state or spool cannot be written.
         """
-        refuse_taken(self._endpoints.control)
+        endpoints = tuple(vars(self._endpoints).values())
+        refuse_files(endpoints)
+        refuse_taken([self._endpoints.control])
         with _locked(self._state_dir) as lock:
+            # Only now: children of a daemon that was killed may have served theirs until the lock was free.
+            refuse_taken(endpoints)
             store = JobStore(self._state_dir / "jobs")
             spool = _spool(self._config, self._state_dir)
             spool.prepare()
@@ -95,9 +98,7 @@ class Daemon:
                 await self._serve(context, store, spool, lock, ready)
             finally:
                 context.destroy(linger=200)
-                for endpoint in vars(self._endpoints).values():
-                    with suppress(FileNotFoundError):
-                        Path(ipc_path(endpoint)).unlink()
+                remove_sockets(endpoints)
 
     def stop(self) -> None:
         """End soon: the scan that acquires is cancelled, what is being decoded is kept for the next daemon."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 import os
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 import zmq
@@ -17,8 +16,9 @@ import zmq
 from scanner.clock import Clock
 from scanner.devices import Image, TriggerMode
 from scanner.sequencer import Rig
-from scanner.wire import MAX_MESSAGE_BYTES, PreviewHeader, encode_preview, ipc_path
+from scanner.wire import MAX_MESSAGE_BYTES, PreviewHeader, encode_preview
 from service.pipe import Preview
+from service.sockets import remove_sockets
 
 POP_NS = 500_000_000
 
@@ -89,8 +89,7 @@ class Previewer:
         """End the preview."""
         self.rest()
         self._context.destroy(linger=0)
-        with suppress(FileNotFoundError):
-            Path(ipc_path(self._endpoint)).unlink()
+        remove_sockets([self._endpoint])
 
     def _begin(self) -> None:
         if self._running:

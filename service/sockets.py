@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import os
 import socket
-from collections.abc import Sequence
+import stat
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import cast
@@ -50,13 +51,50 @@ def bound(context: zmq.asyncio.Context, kind: int, endpoint: str) -> zmq.asyncio
     return opened
 
 
-def refuse_taken(endpoint: str) -> None:
-    """Raise ConfigError where somebody serves the endpoint: binding would take it from them without a word."""
-    with suppress(FileNotFoundError, ConnectionRefusedError), socket.socket(socket.AF_UNIX) as trial:
-        trial.connect(ipc_path(endpoint))
+def refuse_files(endpoints: Iterable[str]) -> None:
+    """Raise ConfigError where an endpoint names what is no socket: libzmq would delete it to bind there.
+
+    Links are not followed: what they point at is not ours to replace.
+    """
+    for endpoint in endpoints:
+        path = Path(ipc_path(endpoint))
+        try:
+            mode = path.lstat().st_mode
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise ConfigError(f"the endpoint {endpoint} cannot be used: {error.strerror}") from error
+        if not stat.S_ISSOCK(mode):
+            raise ConfigError(
+                f"{path} is no socket, and the daemon needs that name for one", hint="give another endpoint"
+            )
+
+
+def refuse_taken(endpoints: Iterable[str]) -> None:
+    """Raise ConfigError where somebody serves an endpoint: binding would take it from them without a word."""
+    for endpoint in endpoints:
+        path = ipc_path(endpoint)
+        try:
+            with socket.socket(socket.AF_UNIX) as trial:
+                trial.connect(path)
+        except (FileNotFoundError, ConnectionRefusedError):  # nobody, or one who died
+            continue
+        except OSError as error:
+            raise ConfigError(
+                f"{path} belongs to somebody else: {error.strerror}", hint="give another endpoint"
+            ) from error
         raise ConfigError(
             f"another daemon serves {endpoint}", hint="end it (fringed status shows it), or give another endpoint"
         )
+
+
+def remove_sockets(endpoints: Iterable[str]) -> None:
+    """Delete the sockets that libzmq leaves; what is no socket is not ours."""
+    for endpoint in endpoints:
+        path = Path(ipc_path(endpoint))
+        with suppress(FileNotFoundError):
+            if stat.S_ISSOCK(path.lstat().st_mode):
+                path.unlink()
 
 
 def send_now(to: zmq.asyncio.Socket, parts: Sequence[bytes]) -> bool:
