@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Reason
+from scanner.decode.frames import FrameCheck
 from scanner.decode.mcp import dense, emissions, hmm, linking, magnification, stripes, subpixel
 from scanner.decode.mcp.locate import Array, Found, Image, Stages, locate
 from scanner.decode.mcp.model import PatternModel
@@ -62,7 +63,7 @@ def decode_image(
         DecodeError: no pattern, another pattern, one turned by 90 degrees, or stripes too fine for the camera.
     """
     pattern.validate(projector)
-    upright = _door(image, pattern, camera)
+    upright = upright_image(image, pattern, camera)
     model = PatternModel.of(pattern, projector)
     clock = Stages()
     found = locate(upright, model, camera, clock)
@@ -87,7 +88,7 @@ def decode_image(
             f"(of {a.clear:.0%} clear code words {a.agree:.0%} fit, {a.order:.0%} of neighbours are in order)",
             hint="check bits, carriers, codes and axis of the description against what is projected",
         )
-    return decoded if pattern.axis == "y" else _turned(decoded)
+    return decoded if pattern.axis == "y" else turned_back(decoded)
 
 
 class McpDecoder:
@@ -103,18 +104,13 @@ class McpDecoder:
         self._sequence = sequence
         self._pattern = sequence.pattern
         self._camera = camera
-        self._seen: set[int] = set()
+        self._check = FrameCheck(sequence, camera)
         self._image: NDArray[Any] | None = None
         self._black: NDArray[Any] | None = None
 
     def add(self, position: int, frame: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
         """Take the frame at `position`; see `scanner.decode.Decoder`."""
-        if not 0 <= position < len(self._sequence):
-            raise DecodeError(f"frame {position} is not in a sequence of {len(self._sequence)}")
-        if position in self._seen:
-            raise DecodeError(f"frame {position} was given twice")
-        _check_frame(frame, self._camera, position)
-        self._seen.add(position)
+        self._check.take(position, frame)
         if position == self._sequence.fringes[0]:
             self._image = frame.copy()
         elif position == self._sequence.black:
@@ -122,12 +118,17 @@ class McpDecoder:
 
     def finish(self) -> Decoded:
         """The maps; see `scanner.decode.Decoder`."""
+        return decode_image(self.frame(), self._pattern, self._sequence.projector, self._camera)
+
+    def frame(self) -> NDArray[Any]:
+        """The one frame, the black one taken off where there is one.
+
+        Raises:
+            DecodeError: it has not come.
+        """
         if self._image is None:
             raise DecodeError("the MCP frame is missing", hint=f"it is frame {self._sequence.fringes[0]}")
-        image = self._image
-        if self._black is not None:
-            image = cv2.subtract(image, self._black)
-        return decode_image(image, self._pattern, self._sequence.projector, self._camera)
+        return self._image if self._black is None else cv2.subtract(self._image, self._black)
 
 
 # --- the door -----------------------------------------------------------------------------------------------------
@@ -155,7 +156,7 @@ _MOSAICS = {
 }
 
 
-def _door(image: NDArray[Any], pattern: McpPattern, camera: CameraFormat) -> Image:
+def upright_image(image: NDArray[Any], pattern: McpPattern, camera: CameraFormat) -> Image:
     """Checked, grey, with horizontal stripes, contiguous."""
     _check_frame(image, camera, 0)
     if camera.mosaic is not None:
@@ -323,7 +324,7 @@ def _upside_down(decoded: Decoded) -> Decoded:
     return _with_maps(decoded, lambda array: array[::-1], details={**decoded.details, "upside_down": True})
 
 
-def _turned(decoded: Decoded) -> Decoded:
+def turned_back(decoded: Decoded) -> Decoded:
     """Rows of the turned image are columns of the image."""
     peaks = decoded.peaks
     if peaks is not None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Reason
 from scanner.decode.mcp.casey2011 import carrier_search, channels, growth, hidden_markov, inclination, stripe_detection
-from scanner.decode.mcp.decoder import McpDecoder, _door, _turned
+from scanner.decode.mcp.decoder import McpDecoder, turned_back, upright_image
 from scanner.decode.mcp.locate import Stages
 from scanner.decode.mcp.model import PatternModel
 from scanner.errors import DecodeError
@@ -54,12 +54,7 @@ class CaseyDecoder(McpDecoder):
 
     def finish(self) -> Decoded:
         """The maps; see `scanner.decode.Decoder`."""
-        if self._image is None:
-            raise DecodeError("the MCP frame is missing", hint=f"it is frame {self._sequence.fringes[0]}")
-        image = self._image
-        if self._black is not None:
-            image = cv2.subtract(image, self._black)
-        return decode_image(image, self._pattern, self._sequence.projector, self._camera, self.stages)
+        return decode_image(self.frame(), self._pattern, self._sequence.projector, self._camera, self.stages)
 
 
 def decode_image(
@@ -88,7 +83,7 @@ def decode_image(
         DecodeError: no stripes, other carriers than described, or codes that contradict the description.
     """
     pattern.validate(projector)
-    upright = _door(image, pattern, camera)
+    upright = upright_image(image, pattern, camera)
     seen: dict[str, NDArray[Any]] = stages if stages is not None else {}
     model = PatternModel.of(pattern, projector)
     clock = Stages()
@@ -123,7 +118,7 @@ def decode_image(
     }
     warnings = () if len(marks.x) else ("stripes and carriers are there, but no stripe could be decided",)
     decoded = replace(decoded, details=details, warnings=warnings)
-    return decoded if pattern.axis == "y" else _turned(decoded)
+    return decoded if pattern.axis == "y" else turned_back(decoded)
 
 
 # --- no pattern ---------------------------------------------------------------------------------------------------
