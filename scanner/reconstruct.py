@@ -16,7 +16,7 @@ import numpy as np
 
 from scanner.capture import Capture, CaptureHeader
 from scanner.compare import compare
-from scanner.decode import Decoder, decoder_for
+from scanner.decode import Decoded, Decoder, Reason, decoder_for
 from scanner.devices import Pixels, Truth
 from scanner.errors import CalibrationError, DecodeError
 from scanner.filters import FilterSettings
@@ -95,7 +95,7 @@ class Reconstruction:
 
         Raises:
             SyncError: the frames are out of step.
-            DecodeError: they cannot be decoded.
+            DecodeError: they cannot be decoded, or no pixel of them can although the scene is lit.
             CalibrationError: the rig cannot triangulate this pattern's axis.
         """
         tell = progress or (lambda _: None)
@@ -107,6 +107,9 @@ class Reconstruction:
         tell("decoding")
         with self._timed("decode"):
             decoded = self._decoder.finish()
+        if len(self._header.sequence) > 1:
+            # The witnesses have seen light: without it the check ends in an error of its own.
+            raise_if_empty(decoded)
         tell("triangulating")
         scan = build_scan(decoded, self._calibration, self._options.filters, timings=self._timings)
         scan = scan.with_report(sync=check.as_dict(), capture=self._capture_report(capture))
@@ -187,6 +190,46 @@ def _require_sizes(header: CaptureHeader, calibration: Calibration) -> None:
                 f"the capture is of one of {here[0]} x {here[1]}",
                 hint=f"use the calibration {hint}",
             )
+
+
+_IN_WORDS = {
+    Reason.SHADOW: "in shadow",
+    Reason.CLIPPED: "clipped",
+    Reason.LOW_MODULATION: "of too little modulation",
+    Reason.UNWRAP_RISK: "of no certain fringe or stripe",
+    Reason.BORDER: "on borders of cells or stripes",
+    Reason.OUT_OF_STEP: "out of step",
+    Reason.MOVED: "moved",
+    Reason.FILTERED: "filtered",
+}
+_REMEDIES = {
+    Reason.SHADOW: "raise the exposure, open the lens or move nearer",
+    Reason.CLIPPED: "lower the exposure or the gain, or close the lens",
+    Reason.LOW_MODULATION: "raise the exposure, focus projector and camera, or take lower frequencies",
+    Reason.UNWRAP_RISK: "look at the order of the frames (fringed audit), correct the projector's gamma "
+    "(precorrection), or take fewer or denser frequencies",
+    Reason.BORDER: "focus projector and camera, or take fewer bits",
+}
+
+
+def raise_if_empty(decoded: Decoded) -> None:
+    """Raise where no pixel at all has a value: an empty cloud is no success.
+
+    Raises:
+        DecodeError: with the reasons that dominate, and what to do about the first of them.
+    """
+    counts = np.bincount(decoded.reason.reshape(-1), minlength=len(Reason))
+    if counts[Reason.VALUE] or not counts.any():
+        return
+    lit = counts.copy()
+    lit[Reason.SHADOW] = 0
+    order = [Reason(int(i)) for i in np.argsort(-lit if lit.any() else -counts, kind="stable")]
+    first = order[0]
+    named = ", ".join(f"{counts[r]:,} {_IN_WORDS[r]}" for r in sorted(_IN_WORDS, key=lambda r: -counts[r]) if counts[r])
+    raise DecodeError(
+        f"no pixel could be decoded although the scene is lit: of {int(counts.sum()):,} pixels {named}",
+        hint=_REMEDIES.get(first, "look at the order of the frames with fringed audit, and capture again"),
+    )
 
 
 def ambiguity_px(sequence: PatternSequence) -> float | None:

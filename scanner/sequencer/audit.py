@@ -9,7 +9,7 @@ from typing import Any
 from scanner.capture import Capture
 from scanner.devices import Pixels
 from scanner.errors import DecodeError
-from scanner.sequencer.disorder import sync_error
+from scanner.sequencer.disorder import RECORDED_HINT, sync_error
 from scanner.sequencer.findings import Witnesses
 from scanner.sequencer.plan import Plan
 from scanner.sequencer.thumbnail import thumbnail
@@ -52,7 +52,9 @@ class CaptureCheck:
             DecodeError: nothing in view is lit.
         """
         if not self.passed:
-            raise sync_error(self.capture.header.sequence, self.verdicts, self.witnesses, self.suspects)
+            raise sync_error(
+                self.capture.header.sequence, self.verdicts, self.witnesses, self.suspects, hint=RECORDED_HINT
+            )
         return self
 
     def as_dict(self) -> dict[str, Any]:
@@ -80,7 +82,8 @@ def check_capture(capture: Capture) -> CaptureCheck:
     """
     header = capture.header
     plan = _plan(header.plan)
-    verdicts = verify(plan, header.sequence, capture.all_records) if plan is not None else _unstamped(capture)
+    stamped = plan is not None and len(capture.all_records) > 0
+    verdicts = verify(plan, header.sequence, capture.all_records) if plan and stamped else _unstamped(capture)
     count = len(header.sequence)
     witnesses = Witnesses()
     if count > 1:

@@ -6,8 +6,17 @@ from collections.abc import Sequence
 
 from scanner.errors import DecodeError, ScannerError, SyncError
 from scanner.patterns import FrameRole, PatternSequence
-from scanner.sequencer.findings import DARK_HINT, Witnesses
+from scanner.sequencer.findings import DARK_HINT, Witnesses, listed
 from scanner.sequencer.verify import FrameVerdict
+
+LIVE_HINT = (
+    "take latency_us and settle_us out of the rig file so that they are measured, or raise dwell; fringed audit draws "
+    "the timing"
+)
+RECORDED_HINT = (
+    "the frames' order or timing is not what capture.json says; capture again, or look at it with fringed audit"
+)
+"""What to do about a rig out of step, and about a folder whose frames are."""
 
 
 def set_of(sequence: PatternSequence, position: int) -> tuple[int, ...]:
@@ -29,6 +38,7 @@ def sync_error(
     witnesses: Witnesses,
     suspects: Sequence[int],
     retakes: int = 0,
+    hint: str = LIVE_HINT,
 ) -> ScannerError:
     """The error that names the frames, says what spoke against them, and what to do."""
     if witnesses.dark:
@@ -39,11 +49,10 @@ def sync_error(
     says = [found.says for found in witnesses.items if not found.passed and found.says]
     reasons = [reason for verdict in verdicts if verdict.suspect for reason in verdict.reasons[:1]]
     detail = "; ".join(dict.fromkeys([*says, *reasons])) or "stamps and content contradict the plan"
-    named = f"frame{'s' if len(frames) != 1 else ''} {', '.join(map(str, frames))}"
+    named = f"frame{'s' if len(frames) != 1 else ''} {listed(frames)}"
     tried = f" after {retakes} retakes" if retakes else ""
     return SyncError(
         f"{named} out of step with the projector{tried}: {detail}",
         frames=frames,
-        hint="take latency_us and settle_us out of the rig file so that they are measured, or raise dwell; "
-        "fringed audit draws the timing",
+        hint=hint,
     )

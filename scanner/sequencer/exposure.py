@@ -13,6 +13,7 @@ import numpy as np
 from scanner.clock import Clock
 from scanner.devices import Camera, CameraCapabilities, CameraSettings, Interval, Projector, TriggerMode
 from scanner.patterns import PatternSequence
+from scanner.sequencer.latency import LONGEST_REFRESHES
 from scanner.sequencer.plan import light_unit_ns
 from scanner.sequencer.shots import BLACK, WHITE, Shots
 
@@ -69,6 +70,9 @@ def auto(
     unit = _unit(projector, caps)
     delay = None if latency is None or settle is None else latency.high_ns + settle.high_ns
     with Shots(projector, camera, clock, trigger_mode=trigger_mode, settings=settings, light_delay_ns=delay) as shots:
+        # Light that comes later than declared would be metered as dim: all shots are of white that has long been on.
+        flip = shots.show(WHITE)
+        clock.sleep_until(flip.t_ns + LONGEST_REFRESHES * projector.capabilities.refresh_ns)
         trial = _in_units(max(unit, 16_000_000), unit, caps)
         level, noise = _white(shots, trial, caps)
         if level >= CEILING:

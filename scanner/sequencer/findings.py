@@ -126,6 +126,17 @@ def look(sequence: PatternSequence, thumbnails: Mapping[int, Pixels], max_value:
     return Scene(sequence, frames, (int(shape[0]), int(shape[1])), max_value, noise, lit, contrast)
 
 
+def listed(frames: Iterable[int]) -> str:
+    """Frame numbers in words, runs of three and more shortened: 3, 5..26."""
+    runs: list[list[int]] = []
+    for frame in sorted(set(frames)):
+        if runs and frame == runs[-1][-1] + 1:
+            runs[-1].append(frame)
+        else:
+            runs.append([frame])
+    return ", ".join(f"{run[0]}..{run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs)
+
+
 def sigma_between(a: Array, b: Array) -> float:
     """1-sigma of one sample from two frames of one picture (or how far two pictures differ, on the same scale).
 

@@ -267,6 +267,7 @@ class _Run:
             if not again:
                 return
             self.retakes += len(again)
+            self.darken()
             self.slots(again)
         if self.doubtful() or self.witnesses.dark:
             raise _Ended(FinishReason.SYNC_LOST, self.out_of_step())
@@ -281,6 +282,13 @@ class _Run:
                 self.missing(pattern, flip)
             else:
                 self.take(pattern, flip, frame)
+
+    def darken(self) -> None:
+        """Black for a while, as before the first round: light that comes late must not follow what it should be."""
+        black = next(iter(self.sequence.sentinels), None)
+        if black is not None:
+            flip = self.projector.show(black)
+            self.clock.sleep_until(flip.t_ns + self.plan.period_ns)
 
     def software(self, flip: Flip) -> CameraFrame | None:
         """Wait for the light, trigger, take this trigger's frame; older ones that still come are dropped."""

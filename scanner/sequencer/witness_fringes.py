@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scanner.patterns import PmpPattern
 from scanner.patterns.pmp import FringeSet
-from scanner.sequencer.findings import Array, Scene, Witness, equal_positions, sigma_between
+from scanner.sequencer.findings import Array, Scene, Witness, equal_positions, listed, sigma_between
 from scanner.sequencer.fringe_fit import (
     MIN_PIXELS,
     Fit,
@@ -116,7 +116,7 @@ def _explained(
         named = " or ".join(f"{fit.positions[i]} and {fit.positions[j]}" for i, j in pairs)
         return wrong, f"fits with frames {named} exchanged, and not as it is"
     if wrong := _false_shifts(fit, bright, noise, gain):
-        return wrong, f"frames {', '.join(map(str, wrong))} show another shift than their own"
+        return wrong, f"frames {listed(wrong)} show another shift than their own"
     foreign = [(p, frame[bright]) for other in others if other is not fit for p, frame in _each(other)]
     if (exchanged := _foreign(fit, foreign, bright, GAIN_NARROW * left)) is not None:
         return exchanged, f"fits with frame {exchanged[1]} in place of {exchanged[0]}, and not as it is"

@@ -8,7 +8,7 @@ import numpy as np
 
 from scanner.patterns import FrameRole
 from scanner.patterns.sequence import SENTINELS_AFTER, SENTINELS_BEFORE
-from scanner.sequencer.findings import Scene, Witness
+from scanner.sequencer.findings import Scene, Witness, listed
 
 SENTINEL_TOLERANCE = 0.05
 """Share of the contrast by which equal sentinels may differ. Lamps drift by 1-3 % in seconds and mains light adds as
@@ -33,6 +33,8 @@ def _sentinels(scene: Scene, cannot: list[str]) -> list[Witness]:
         cannot.append("frames that all come late by whole patterns (no sentinels)")
         return []
     levels, ambient = _levels(scene, planned)
+    if _clipped(scene, [p for p in here if planned[p]]) > 0.5:
+        cannot.append("exposures that straddle the flips by little (full white is clipped)")
     dark = min(SENTINEL_TOLERANCE, BLACK_TOLERANCE + FLICKER * ambient)
     off = {p: abs(levels[p] - planned[p]) / (SENTINEL_TOLERANCE if planned[p] else dark) for p in here}
     wrong = [p for p in here if off[p] > 1]
@@ -42,6 +44,14 @@ def _sentinels(scene: Scene, cannot: list[str]) -> list[Witness]:
         return [Witness("sentinels", True, value, limit, says="black and white frames are where planned")]
     says, whole = _explain_sentinels(scene, levels, planned, wrong)
     return [Witness("sentinels", False, value, limit, tuple(wrong), says, whole)]
+
+
+def _clipped(scene: Scene, positions: Sequence[int]) -> float:
+    """Share of the lit pixels at which all of these frames are at the camera's limit."""
+    if not positions or not scene.lit.any():
+        return 0.0
+    least = np.min([scene.frames[p][scene.lit] for p in positions], axis=0)
+    return float(np.mean(least >= scene.max_value))
 
 
 def _levels(scene: Scene, planned: Mapping[int, float]) -> tuple[dict[int, float], float]:
@@ -83,7 +93,7 @@ def _explain_sentinels(
     if len(partial) >= 2:
         named = ", ".join(f"{p} at {levels[p]:.0%}" for p in partial)
         return f"sentinels are neither black nor white ({named} of white): exposures straddle the flips", True
-    return f"sentinels {', '.join(map(str, wrong))} do not show the black or white that was planned", True
+    return f"sentinels {listed(wrong)} do not show the black or white that was planned", True
 
 
 def _white_and_black(scene: Scene) -> list[Witness]:

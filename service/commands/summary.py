@@ -45,13 +45,15 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     facts = []
     if (lit := (report.get("coverage") or {}).get("lit")) is not None:
         facts.append(("coverage", f"{lit:.1%} of lit pixels"))
-    if spread := report.get("depth_mm"):
-        facts.append(("depth", f"{spread['p1']:.1f} .. {spread['p99']:.1f} mm (1st to 99th percentile)"))
+    spread = report.get("depth_mm") or {}
+    if (near := spread.get("p1")) is not None and (far := spread.get("p99")) is not None:
+        facts.append(("depth", f"{near:.1f} .. {far:.1f} mm (1st to 99th percentile)"))
     if removed := {name: count for name, count in (report.get("removed") or {}).items() if count}:
         facts.append(("filtered", ", ".join(f"{count:,} {name}" for name, count in removed.items())))
     inside = (report.get("truth") or {}).get("inside") or {}
-    if error := inside.get("depth_mm"):
-        facts.append(("depth error", f"{error['rms']:.3f} mm rms, {error['p99']:.3f} mm in 99 of 100 points"))
+    error = inside.get("depth_mm") or {}
+    if (rms := error.get("rms")) is not None and (p99 := error.get("p99")) is not None:
+        facts.append(("depth error", f"{rms:.3f} mm rms, {p99:.3f} mm in 99 of 100 points"))
     if (wrong := inside.get("wrong")) is not None:
         facts.append(("wrong", f"{wrong:,} points on a wrong fringe or stripe"))
     return facts

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from scanner.capture import Capture, CaptureHeader, CaptureWriter, FrameRecord
+from scanner.decode import Decoded, Reason
 from scanner.devices import TriggerMode
 from scanner.errors import DecodeError, DeviceLost, SyncError
 from scanner.patterns import PatternSequence, PmpPattern
+from scanner.reconstruct import raise_if_empty, reconstruct
 from scanner.sequencer import FinishReason, check_capture
 from tests.unit.sequencer_bench import Taken, pmp, take
 
@@ -258,3 +260,70 @@ def test_an_audit_finds_a_stamp_outside_its_patterns_time(tmp_path: Path) -> Non
     with pytest.raises(SyncError) as error:
         check_capture(written(tmp_path / "capture", taken)).raise_if_out_of_step()
     assert error.value.frames == (9,)
+
+
+# --- what a user is told ------------------------------------------------------------------------------------------
+
+
+def test_light_that_comes_a_refresh_late_is_metered_right_and_accused() -> None:
+    from drivers.registry import open_camera, open_projector  # noqa: PLC0415
+    from scanner.clock import VirtualClock  # noqa: PLC0415
+    from scanner.sequencer import auto_exposure  # noqa: PLC0415
+
+    chosen = []
+    for extra in (0, 20_000):
+        clock, device = VirtualClock(), f"quick/board?seed=1&extra_latency_us={extra}"
+        projector, camera = open_projector("simulated", device, {}, clock), open_camera("simulated", device, {}, clock)
+        chosen.append(auto_exposure(projector, camera, clock).exposure_ns)
+        camera.close()
+        projector.close()
+    assert chosen[0] == chosen[1]
+    for exposure_ns in (chosen[1], 133_333_000):
+        taken = take(EIGHT, "extra_latency_us=20000", exposure_ns=exposure_ns)
+        assert taken.acquisition.reason is FinishReason.SYNC_LOST, exposure_ns
+        assert_never_wrong(taken)
+
+
+def test_a_whole_sequence_in_doubt_is_named_shortly() -> None:
+    error = take(EIGHT, "order=reverse").acquisition.error
+    assert isinstance(error, SyncError)
+    assert error.frames == tuple(range(len(EIGHT)))
+    assert f"frames 0..{len(EIGHT) - 1} out of step" in error.message
+    assert "latency_us" in (error.hint or "")
+
+
+def test_a_folder_out_of_step_is_not_told_to_measure_latencies(tmp_path: Path) -> None:
+    with pytest.raises(SyncError) as error:
+        check_capture(written(tmp_path / "capture", take(EIGHT), {5: 6, 6: 5})).raise_if_out_of_step()
+    assert error.value.frames == (5, 6)
+    assert "capture.json" in (error.value.hint or "")
+    assert "latency_us" not in (error.value.hint or "")
+
+
+def test_a_folder_with_a_plan_and_no_stamps_is_judged_by_its_content(tmp_path: Path) -> None:
+    capture = written(tmp_path / "capture", take(EIGHT))
+    (capture.path / "frames.jsonl").unlink()
+    check = check_capture(Capture.open(capture.path)).raise_if_out_of_step()
+    assert check.summary() == {"proved": 0, "consistent": 0, "unproved": len(EIGHT)}
+
+
+def test_a_scan_without_a_single_value_is_an_error_that_says_why() -> None:
+    reason = np.full((20, 30), Reason.UNWRAP_RISK, dtype=np.uint8)
+    reason[:15] = Reason.SHADOW
+    empty = np.full(reason.shape, np.nan, dtype=np.float32)
+    zeros = np.zeros_like(empty)
+    decoded = Decoded(empty, None, empty, None, zeros, zeros, zeros, reason)
+    with pytest.raises(DecodeError, match="450 in shadow, 150 of no certain fringe") as error:
+        raise_if_empty(decoded)
+    assert "order of the frames" in (error.value.hint or "")
+    reason[0, 0] = Reason.VALUE
+    raise_if_empty(decoded)
+
+
+def test_three_shifts_all_reversed_never_give_an_empty_success(tmp_path: Path) -> None:
+    sequence = pmp((1.0, 8.0, 64.0), (3, 3, 3))
+    wrong = dict(zip(sequence.fringes, sequence.fringes[::-1], strict=True))
+    capture = written(tmp_path / "capture", take(sequence), wrong)
+    with pytest.raises((SyncError, DecodeError)) as error:
+        reconstruct(capture, None)
+    assert error.value.hint
