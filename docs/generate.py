@@ -13,8 +13,8 @@ from typing import Any
 
 import typer
 
-from service.cli import app
 from service.config import RigConfig
+from service.program import app
 
 HERE = Path(__file__).parent
 

@@ -1,130 +1,74 @@
-"""The command `fringed`: its commands by name, and what becomes of errors (formats.md, Commands).
+"""The command `fringed`: its signals, and then the program (formats.md, Commands).
 
-Exit status 0: done; 1: the work failed, with message and hint on standard error; 2: wrong usage; 130: interrupted.
-What each command does stands in `service.commands`; they import devices, arrays and sockets when they run.
+Exit status 0: done; 1: the work failed, with message and hint on standard error; 2: wrong usage; 129, 130, 143: ended
+by SIGHUP (its terminal was closed), SIGINT, SIGTERM. The commands stand in `service.program`, which takes a while to
+import: this file is quick, so that an early Ctrl-C finds its handler.
 """
 
 from __future__ import annotations
 
 import os
 import signal
+import stat
 import sys
-import tempfile
-import traceback
-from collections.abc import Sequence
-from importlib import metadata
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from types import FrameType
-from typing import Annotated, Any
 
-import typer
-
-from scanner.errors import ScannerError
-from service.commands import audit, check_config, daemon, decode, devices, patterns, scan
-from service.terminal import error_document, print_error, print_json
-
-FAILED, WRONG_USAGE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
-
-# The root of usage errors, wherever the installed version of typer keeps it.
-_UsageError: Any = typer.BadParameter.__mro__[1]
-
-app = typer.Typer(
-    name="fringed",
-    help="Structured-light 3-D scanner: projector, camera and trigger board in step, point clouds in millimetres.",
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-app.command()(scan.scan)
-app.command()(decode.decode)
-app.command()(audit.audit)
-app.command()(patterns.patterns)
-app.command()(devices.devices)
-app.command("check-config")(check_config.check_config)
-app.command()(daemon.daemon)
-app.command()(daemon.worker)
-app.command()(daemon.status)
+INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status. No traceback reaches the user, but for `--debug`."""
+    """Run one command and return its exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     # Both belong to the whole program: they hold wherever they stand.
     debug, as_json = "--debug" in words, "--json" in words
     words = [word for word in words if word != "--debug"] or ["--help"]
-    previous = signal.signal(signal.SIGTERM, _terminated)
     try:
-        return _flushed(_run(words, as_json))
-    except BrokenPipeError:
-        # The reader has what it wanted (fringed ... | head). Python must not write there again when it exits.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
-    except Exception as error:  # noqa: BLE001  (the last line of defence: a bug is reported, not shown as a traceback)
-        _report_bug(error, debug=debug, as_json=as_json)
-        return FAILED
+        with _signals():
+            with _interrupts_at_once():
+                from service.program import run  # noqa: PLC0415
+            return run(words, debug=debug, as_json=as_json)
+    except KeyboardInterrupt:  # again, while the first one was being answered
+        return INTERRUPTED
+
+
+@contextmanager
+def _signals() -> Iterator[None]:
+    """SIGTERM and SIGHUP end the program like Ctrl-C, by an exception: whatever is under way tidies up behind it."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    signal.signal(signal.SIGTERM, _end)
+    if before[signal.SIGHUP] is not signal.SIG_IGN:  # nohup
+        signal.signal(signal.SIGHUP, _end)
+    try:
+        yield
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
-@app.callback()
-def _options(
-    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an unexpected error.")] = False,
-) -> None:
-    pass
-
-
-def _run(words: list[str], as_json: bool) -> int:
-    if words == ["--version"]:
-        print(f"fringed {metadata.version('fringed')}")
-        return 0
+@contextmanager
+def _interrupts_at_once() -> Iterator[None]:
+    """Ctrl-C while modules are imported ends the process there and then: an exception would leave some half made."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.SIG_IGN:  # a shell's background job
+        signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
     try:
-        status = int(app(words, prog_name="fringed", standalone_mode=False) or 0)
-        return _interrupted(as_json) if status == INTERRUPTED else status  # newer typers return it, older ones raise
-    except ScannerError as error:
-        print_error(str(error), error.hint)
-        if as_json:
-            print_json(error_document(error))
-        return FAILED
-    except _UsageError as error:
-        context = getattr(error, "ctx", None)
-        path = context.command_path if context is not None else "fringed"
-        message = error.format_message().removeprefix("Invalid value: ")
-        print_error(message, f"{path} --help")
-        if as_json:
-            print_json({"error": {"code": WRONG_USAGE, "message": message, "class": "UsageError"}})
-        return WRONG_USAGE
-    except (KeyboardInterrupt, typer.Abort):
-        return _interrupted(as_json)
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
-def _interrupted(as_json: bool) -> int:
-    print_error("interrupted")
-    if as_json:
-        print_json({"error": {"code": INTERRUPTED, "message": "interrupted", "class": "Interrupted"}})
-    return INTERRUPTED
+def _end(number: int, _frame: FrameType | None) -> None:
+    if number == signal.SIGHUP:
+        # The terminal is gone. Writing to it would fail, in the middle of the tidying up. (isatty now says no.)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for descriptor in (1, 2):
+            if stat.S_ISCHR(os.fstat(descriptor).st_mode):
+                os.dup2(nowhere, descriptor)
+        os.close(nowhere)
+    raise SystemExit(128 + number)
 
 
-def _flushed(status: int) -> int:
-    sys.stdout.flush()
-    return status
-
-
-def _terminated(number: int, frame: FrameType | None) -> None:
-    # An exception lets every `finally` and `with` on the way out do its work: private daemons end, folders are tidied.
-    raise SystemExit(TERMINATED)
-
-
-def _report_bug(error: Exception, *, debug: bool, as_json: bool) -> None:
-    text = "".join(traceback.format_exception(error))
-    message = f"unexpected {type(error).__name__}: {error}"
-    if debug:
-        print(text, file=sys.stderr)
-        print_error(message)
-    else:
-        descriptor, name = tempfile.mkstemp(prefix="fringed-error-", suffix=".log")
-        os.close(descriptor)
-        Path(name).write_text(text, encoding="utf-8")
-        print_error(message, f"this is a bug; what happened stands in {name} (--debug shows it here)")
-    if as_json:
-        print_json({"error": {"code": FAILED, "message": message, "class": type(error).__name__}})
+if __name__ == "__main__":
+    sys.exit(main())

@@ -11,6 +11,8 @@ import asyncio
 import fcntl
 import logging
 import os
+import select
+import shutil
 import signal
 import sys
 import time
@@ -228,7 +230,7 @@ def _spool(config: RigConfig, state_dir: Path) -> Spool:
 def run_daemon(
     config: RigConfig, *, state_dir: Path = DEFAULT_STATE, endpoint: str = "", lifeline: bool = False
 ) -> None:
-    """Run a daemon until it is told to end: by a client, SIGTERM or SIGINT, or its lifeline.
+    """Run a daemon until it is told to end: by a client, SIGTERM, SIGINT or SIGHUP, or its lifeline.
 
     Args:
         config: the rig.
@@ -245,7 +247,9 @@ def run_daemon(
 async def _run(config: RigConfig, state_dir: Path, endpoint: str, lifeline: bool) -> None:
     daemon = Daemon(config, state_dir=state_dir, endpoint=endpoint)
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+            continue  # nohup
         loop.add_signal_handler(number, daemon.stop)
     ready = asyncio.Event()
     telling = asyncio.create_task(_tell_ready(ready)) if lifeline else None
@@ -277,8 +281,18 @@ def main() -> int:
     parser.add_argument("--state", type=Path, default=DEFAULT_STATE, help="folder of job records")
     parser.add_argument("--private", type=Path, help="keep sockets, records and spool in this folder")
     parser.add_argument("--lifeline", action="store_true", help="end when standard input closes")
+    parser.add_argument("--fleeting", action="store_true", help="delete the private folder when the lifeline closed")
     given = parser.parse_args()
     start_logging("daemon")
+    try:
+        return _served(given)
+    finally:
+        # Whoever made the folder may have been killed. Where this daemon failed it still needs the log in there.
+        if given.private is not None and given.fleeting and _lifeline_closed():
+            shutil.rmtree(given.private, ignore_errors=True)
+
+
+def _served(given: argparse.Namespace) -> int:
     try:
         from service.config import load_rig  # noqa: PLC0415  (after logging: its errors are logged)
 
@@ -292,6 +306,11 @@ def main() -> int:
         _log.error("%s%s", error, f" ({error.hint})" if error.hint else "")
         return 1
     return 0
+
+
+def _lifeline_closed() -> bool:
+    readable, _, _ = select.select([sys.stdin], [], [], 0)
+    return bool(readable) and not os.read(sys.stdin.fileno(), 64)
 
 
 if __name__ == "__main__":

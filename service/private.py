@@ -1,12 +1,14 @@
 """A daemon of one's own: started for one command, in a folder that only this user can open, gone when the command ends.
 
 The same processes and the same wire as the daemon of a rig. Its lifeline is a pipe from the caller: it ends with the
-caller, also when that is killed. What it logged is kept only where the daemon itself failed.
+caller, also when that is killed, and then removes its folder itself. Its log is kept where an error sends its reader
+there: where a process died.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import select
 import shutil
 import subprocess
@@ -17,7 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scanner.errors import Unreachable
+from scanner.errors import ScannerError, Unreachable
 from scanner.session import unreachable
 
 if TYPE_CHECKING:
@@ -33,9 +35,13 @@ LOG_FILE = "daemon.log"
 def private_daemon(config: RigConfig) -> Iterator[str]:
     """Run a daemon for this rig; yields its endpoint. Everything is removed at the end.
 
+    It has a worker of its own also where the rig file leaves decoding to others: they cannot know its endpoint.
+
     Raises:
         Unreachable: it did not start, or died; the hint names its log, which is then kept.
     """
+    daemon = config.daemon.model_copy(update={"workers": max(1, config.daemon.workers)})
+    config = config.model_copy(update={"daemon": daemon})
     folder = Path(tempfile.mkdtemp(prefix="fringed-"))  # 0700
     try:
         (folder / RIG_FILE).write_text(config.as_toml(), encoding="utf-8")
@@ -45,9 +51,11 @@ def private_daemon(config: RigConfig) -> Iterator[str]:
             _await_ready(process, folder)
             try:
                 yield f"ipc://{folder}/control.ipc"
-            except Unreachable as error:
-                if process.poll() is not None:
+            except ScannerError as error:
+                if isinstance(error, Unreachable) and process.poll() is not None:
                     raise _died(process, folder) from error
+                if re.search(r"\blog\b", error.hint or ""):
+                    error.hint = f"{error.hint}; the log is kept: {_kept_log(folder)}"
                 raise
         finally:
             _end(process)
@@ -67,6 +75,7 @@ def _started(folder: Path, log: int) -> subprocess.Popen[bytes]:
             "--private",
             str(folder),
             "--lifeline",
+            "--fleeting",
         ],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -86,12 +95,16 @@ def _await_ready(process: subprocess.Popen[bytes], folder: Path) -> None:
 
 
 def _died(process: subprocess.Popen[bytes], folder: Path) -> Unreachable:
+    error = unreachable(str(folder), f"the private daemon ended with status {process.returncode}")
+    error.hint = f"its log is kept: {_kept_log(folder)}"
+    return error
+
+
+def _kept_log(folder: Path) -> str:
     descriptor, kept = tempfile.mkstemp(prefix="fringed-", suffix=".log")
     os.close(descriptor)
     shutil.copyfile(folder / LOG_FILE, kept)
-    error = unreachable(str(folder), f"the private daemon ended with status {process.returncode}")
-    error.hint = f"its log is kept: {kept}"
-    return error
+    return kept
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -79,7 +79,8 @@ class Work:
                 self._fail(message.delivery, error)
             except Exception as error:  # noqa: BLE001  (a decoder that fails on one capture serves the next)
                 _log.exception("decoding failed")
-                self._fail(message.delivery, DecodeError(f"the decoder failed: {type(error).__name__}: {error}"))
+                problem = f"the decoder failed: {type(error).__name__}: {error}"
+                self._fail(message.delivery, DecodeError(problem, hint="look at the log for the cause"))
 
     def _fail(self, delivery: int, error: ScannerError) -> None:
         self._series = None

@@ -220,7 +220,8 @@ class WorkerPool:
             WorkerLost(
                 DecodeError(
                     f"the capture of job {series.job} was given up: sent {series.deliveries} times, and the last {why}",
-                    hint=f"the capture is kept; on the daemon's machine try: fringed decode {series.capture}",
+                    hint=f"the capture is kept; on the daemon's machine try: fringed decode {series.capture}; "
+                    "look at the log for the cause",
                 )
             )
         )

@@ -211,12 +211,15 @@ def test_two_daemons_on_one_state_are_refused(daemon: Callable[..., RunningDaemo
     assert "another daemon" in second.stderr
 
 
-def test_sigterm_ends_a_daemon_in_order(daemon: Callable[..., RunningDaemon], tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_daemon_in_order(
+    number: signal.Signals, daemon: Callable[..., RunningDaemon], tmp_path: Path
+) -> None:
     running = daemon()
     with Client(running.endpoint) as client:
         job = client.start_scan("pmp")
         wait_for_event(client, job, "frame")
-        running.process.terminate()
+        running.process.send_signal(number)
         assert running.process.wait(10) == 0
     assert not list((tmp_path / "state").glob("*.ipc"))
     assert '"cancelled"' in (tmp_path / "state" / "jobs" / f"{job}.json").read_text()

@@ -1,11 +1,12 @@
 """`fringed scan` as a process: from nothing to files, interrupted, refused, and against a running daemon."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -29,9 +30,13 @@ def fringed(*words: Any) -> subprocess.CompletedProcess[str]:
 
 
 @contextmanager
-def running(*words: Any) -> Iterator[subprocess.Popen[str]]:
+def running(*words: Any, environment: Mapping[str, str] | None = None) -> Iterator[subprocess.Popen[str]]:
     with subprocess.Popen(
-        [*FRINGED, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*FRINGED, *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **(environment or {})},
     ) as it:
         try:
             yield it
@@ -69,7 +74,7 @@ def test_a_scan_from_nothing_to_files_and_again(tmp_path: Path) -> None:
     assert (tmp_path / "timing.svg").read_text().lstrip().startswith("<")
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_scan_told_to_stop_leaves_nothing(number: signal.Signals, status: int, tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "out"
     with running("scan", "--rig", "simulated:quick/board", "--repeat", "20", "-o", folder) as scan:
@@ -82,6 +87,38 @@ def test_a_scan_told_to_stop_leaves_nothing(number: signal.Signals, status: int,
     assert scan.returncode == status
     assert out == ""
     assert not (tmp_path / "deep").exists()
+
+
+def test_a_scan_that_is_killed_leaves_no_private_folder(tmp_path: Path) -> None:
+    private = tmp_path / "private"
+    private.mkdir()
+    words = ("scan", "--rig", "simulated:quick/board", "--repeat", "20", "-o", tmp_path / "out")
+    with running(*words, environment={"TMPDIR": str(private)}) as scan:
+        deadline = time.monotonic() + PATIENCE_S
+        while not list(private.glob("fringed-*/spool/*/capture/frames.npy")):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        scan.kill()
+    while list(private.iterdir()):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("imported", ["service.program", "typer", "scanner.client"])
+def test_an_early_interrupt_is_quiet(imported: str, tmp_path: Path) -> None:
+    program = f"""
+import os, signal, sys
+from service.cli import main
+class Early:
+    def find_spec(self, name, path=None, target=None):
+        if name == {imported!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Early())
+sys.exit(main(["status", "--connect", "ipc://{tmp_path}/control.ipc"]))
+"""
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stdout) == (130, "")
+    assert "Traceback" not in ran.stderr
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ import pytest
 import zmq
 
 from scanner.client import AsyncClient, Client
-from scanner.errors import ConfigError, StorageError, Unreachable
+from scanner.errors import ConfigError, DeviceLost, StorageError, Unreachable
 from scanner.wire import MAX_REQUEST_BYTES, Event, Refused, decode_preview
 from service.config import RigConfig, load_rig
 from service.private import private_daemon
@@ -384,3 +384,18 @@ def test_a_private_daemon_that_cannot_start_names_its_log(monkeypatch: pytest.Mo
     assert "rig.toml" in log.read_text()
     log.unlink()
     assert log.parent == Path(tempfile.gettempdir())
+
+
+def test_a_private_daemon_has_a_worker_whatever_the_rig_file_says() -> None:
+    rig = load_rig(RIG)
+    alone = rig.model_copy(update={"daemon": rig.daemon.model_copy(update={"workers": 0})})
+    with private_daemon(alone) as endpoint, Client(endpoint) as client:
+        assert client.scan("mcp").xyz is not None
+
+
+def test_a_private_daemon_keeps_the_log_that_an_error_points_to() -> None:
+    with pytest.raises(DeviceLost) as caught, private_daemon(load_rig(RIG)):
+        raise DeviceLost("the devices process died", hint="look at the log for the cause")
+    log = Path(str(caught.value.hint).rpartition(": ")[2])
+    assert "serving ipc://" in log.read_text()
+    log.unlink()

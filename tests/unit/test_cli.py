@@ -17,7 +17,7 @@ import typer
 
 from scanner.patterns import PatternSequence, ProjectorSize
 from scanner.scan import load_scan
-from service import cli
+from service import cli, program
 from service.commands import devices
 
 FRINGED = (sys.executable, "-c", "import sys; from service.cli import main; sys.exit(main())")
@@ -141,8 +141,8 @@ def test_a_bug_shows_one_line_and_where_the_rest_is(
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     said: list[tuple[Any, ...]] = []
-    monkeypatch.setattr(cli, "print_error", lambda *words: said.append(words))
-    monkeypatch.setattr(cli, "_run", lambda words, as_json: [].pop())
+    monkeypatch.setattr(program, "print_error", lambda *words: said.append(words))
+    monkeypatch.setattr(program, "_run", lambda words, as_json: [].pop())
     assert cli.main(["devices", *(["--debug"] if debug else [])]) == 1
     assert said[0][0] == "unexpected IndexError: pop from empty list"
     logs = list(tmp_path.glob("fringed-error-*.log"))
@@ -173,7 +173,9 @@ def test_a_closed_pipe_is_no_error() -> None:
 
 
 def test_the_command_line_starts_without_array_libraries() -> None:
-    heavy = "import sys, service.cli; print(sorted({'numpy', 'numba', 'cv2', 'zmq', 'pydantic'} & set(sys.modules)))"
+    heavy = (
+        "import sys, service.program; print(sorted({'numpy', 'numba', 'cv2', 'zmq', 'pydantic'} & set(sys.modules)))"
+    )
     ran = subprocess.run([sys.executable, "-c", heavy], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == "[]"
 

@@ -1,0 +1,114 @@
+"""The program behind `fringed`: its commands by name, and what becomes of errors. Signals are `service.cli`'s.
+
+What each command does stands in `service.commands`; they import devices, arrays and sockets when they run.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import traceback
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from scanner.errors import ScannerError
+from service.commands import audit, check_config, daemon, decode, devices, patterns, scan
+from service.terminal import error_document, print_error, print_json
+
+FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
+
+# The root of usage errors, wherever the installed version of typer keeps it.
+_UsageError: Any = typer.BadParameter.__mro__[1]
+
+app = typer.Typer(
+    name="fringed",
+    help="Structured-light 3-D scanner: projector, camera and trigger board in step, point clouds in millimetres.",
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command()(scan.scan)
+app.command()(decode.decode)
+app.command()(audit.audit)
+app.command()(patterns.patterns)
+app.command()(devices.devices)
+app.command("check-config")(check_config.check_config)
+app.command()(daemon.daemon)
+app.command()(daemon.worker)
+app.command()(daemon.status)
+
+
+def run(words: list[str], *, debug: bool, as_json: bool) -> int:
+    """Run one command and return its exit status. No traceback reaches the user, but for `debug`."""
+    try:
+        return _flushed(_run(words, as_json))
+    except BrokenPipeError:
+        # The reader has what it wanted (fringed ... | head). Python must not write there again when it exits.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except Exception as error:  # noqa: BLE001  (the last line of defence: a bug is reported, not shown as a traceback)
+        _report_bug(error, debug=debug, as_json=as_json)
+        return FAILED
+
+
+@app.callback()
+def _options(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an unexpected error.")] = False,
+) -> None:
+    pass
+
+
+def _run(words: list[str], as_json: bool) -> int:
+    if words == ["--version"]:
+        print(f"fringed {metadata.version('fringed')}")
+        return 0
+    try:
+        status = int(app(words, prog_name="fringed", standalone_mode=False) or 0)
+        return _interrupted(as_json) if status == INTERRUPTED else status  # newer typers return it, older ones raise
+    except ScannerError as error:
+        print_error(str(error), error.hint)
+        if as_json:
+            print_json(error_document(error))
+        return FAILED
+    except _UsageError as error:
+        context = getattr(error, "ctx", None)
+        path = context.command_path if context is not None else "fringed"
+        message = error.format_message().removeprefix("Invalid value: ")
+        print_error(message, f"{path} --help")
+        if as_json:
+            print_json({"error": {"code": WRONG_USAGE, "message": message, "class": "UsageError"}})
+        return WRONG_USAGE
+    except (KeyboardInterrupt, typer.Abort):
+        return _interrupted(as_json)
+
+
+def _interrupted(as_json: bool) -> int:
+    print_error("interrupted")
+    if as_json:
+        print_json({"error": {"code": INTERRUPTED, "message": "interrupted", "class": "Interrupted"}})
+    return INTERRUPTED
+
+
+def _flushed(status: int) -> int:
+    sys.stdout.flush()
+    return status
+
+
+def _report_bug(error: Exception, *, debug: bool, as_json: bool) -> None:
+    text = "".join(traceback.format_exception(error))
+    message = f"unexpected {type(error).__name__}: {error}"
+    if debug:
+        print(text, file=sys.stderr)
+        print_error(message)
+    else:
+        descriptor, name = tempfile.mkstemp(prefix="fringed-error-", suffix=".log")
+        os.close(descriptor)
+        Path(name).write_text(text, encoding="utf-8")
+        print_error(message, f"this is a bug; what happened stands in {name} (--debug shows it here)")
+    if as_json:
+        print_json({"error": {"code": FAILED, "message": message, "class": type(error).__name__}})
