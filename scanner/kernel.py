@@ -6,22 +6,31 @@ its source, and has a plain NumPy form in its test.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import numba
+from scanner.kernel_cache import choose_cache
+
+CACHED = choose_cache(Path(__file__).parent, os.environ)
+"""False where no folder can hold compiled kernels: they are then compiled by every process."""
+
+import numba  # noqa: E402  (it reads the folder's name when it is imported)
+
+cast(Any, numba).core.config.reload_config()  # for one who imported it earlier
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
 def kernel(function: _F) -> _F:
     """Compile `function` for one thread, cached, without the interpreter lock."""
-    return cast(_F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    return cast(_F, numba.njit(cache=CACHED, nogil=True, error_model="numpy")(function))
 
 
 def parallel_kernel(function: _F) -> _F:
     """Compile `function` for all threads (`numba.prange`), cached, without the interpreter lock."""
-    return cast(_F, numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")(function))
+    return cast(_F, numba.njit(cache=CACHED, nogil=True, parallel=True, error_model="numpy")(function))
 
 
 def summing_kernel(function: _F) -> _F:
@@ -30,4 +39,4 @@ def summing_kernel(function: _F) -> _F:
     Results may differ in the last bits from one machine to another. NaN and infinity keep their meaning.
     """
     options = {"reassoc", "contract", "nsz"}
-    return cast(_F, numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=options)(function))
+    return cast(_F, numba.njit(cache=CACHED, nogil=True, error_model="numpy", fastmath=options)(function))
