@@ -13,7 +13,7 @@ from msgspec import to_builtins
 
 from scanner.capture import CaptureHeader, CaptureWriter, FrameRecord, State
 from scanner.clock import Clock
-from scanner.devices import KnowsTruth
+from scanner.devices import Image, KnowsTruth
 from scanner.errors import ConfigError, DeviceError, DeviceLost, ScannerError, StorageError, SyncError
 from scanner.patterns import CameraFormat
 from scanner.sequencer import Acquisition, FinishReason, Plan, acquire, auto_exposure
@@ -82,6 +82,10 @@ class Scan:
 
     def run(self, write_backs: WriteBacks) -> None:
         """Take the frames, and say `taken` when the devices are free; `ended` follows when the folder is closed."""
+        images = self._images()
+        if self._cancelled.is_set():
+            self._say(Ended(self.job, "cancelled"))
+            return
         calibration = self._opened.calibration
         header = CaptureHeader(
             self._sequence,
@@ -99,7 +103,7 @@ class Scan:
                     replace_json(self._folder / "calibration.json", calibration.as_dict())
                 self._write_truth()
                 self._say(Began(self.job))
-                outcome = self._acquire(writer, disk)
+                outcome = self._acquire(writer, disk, images)
             except ScannerError as error:
                 disk.close("failed", _reason_of(error), (), self._ended_by(error))
                 return
@@ -124,7 +128,17 @@ class Scan:
         """The report of a scan that never began."""
         return Ended(self.job, None, error=None if error is None else error_body(error))
 
-    def _acquire(self, writer: CaptureWriter, disk: WriteBack) -> Acquisition:
+    def _images(self) -> list[Image]:
+        """What the projector is to load, as far as it was made until a cancel; nothing where it holds the sequence."""
+        images: list[Image] = []
+        if self._opened.loaded != self._sequence:
+            for position in range(len(self._sequence)):
+                if self._cancelled.is_set():
+                    break
+                images.append(self._opened.rig.oriented(self._sequence.image(position)))
+        return images
+
+    def _acquire(self, writer: CaptureWriter, disk: WriteBack, images: list[Image]) -> Acquisition:
         def on_frame(record: FrameRecord, _offset: int | None) -> None:
             self._lines += 1
             if record.slot is not None:
@@ -134,7 +148,9 @@ class Scan:
             self._say(Frames(self.job, self._lines, len(self._seen), self._retakes))
 
         opened = self._opened
-        load, opened.loaded = opened.loaded != self._sequence, None
+        opened.loaded = None
+        if images:
+            opened.rig.projector.load(images)
         outcome = acquire(
             opened.rig,
             self._plan,
@@ -143,7 +159,7 @@ class Scan:
             self._clock,
             on_frame=on_frame,
             cancelled=self._cancelled.is_set,
-            load=load,
+            load=False,
         )
         if outcome.reason is not FinishReason.DEVICE_LOST:
             opened.loaded = self._sequence

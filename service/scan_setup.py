@@ -38,6 +38,12 @@ PMP_FINEST = 64
 PMP_LEAST_PERIOD_PX = 8
 """A default fringe has at least this many projector pixels: four for each half wave, so that it is still a cosine."""
 
+MAX_IMAGES = 1024
+"""Fringe images of one sequence: the projector holds them all, 2 GB of 1920 x 1080."""
+
+MAX_FRAMES = 65_536
+"""Frames of one scan, repetitions included, unless one image stays on: 18 minutes at 60 Hz, and nobody else's turn."""
+
 
 @dataclass
 class OpenRig:
@@ -158,9 +164,25 @@ def sequence_for(opened: OpenRig, params: ScanStart) -> PatternSequence:
     axis: Axis = opened.settings["rig"]["phase_axis"] or known
     try:
         pattern = pattern_for(params.method, params.pattern or {}, axis, projector)
+        check_length(pattern.fringe_count, params.repeat)
         return PatternSequence.bracketed(projector, pattern, _precorrection(opened.calibration))
     except DecodeError as error:
         raise ConfigError(error.message, hint=error.hint) from error
+
+
+def check_length(images: int, repeat: int) -> None:
+    """Refuse a scan that would fill memory, or the day, before an image of it is made.
+
+    Raises:
+        ConfigError: more than MAX_IMAGES, or MAX_FRAMES in all.
+    """
+    if images > MAX_IMAGES:
+        raise ConfigError(f"the pattern has {images} images, more than {MAX_IMAGES}", hint="give fewer shifts")
+    if images > 1 and images * repeat > MAX_FRAMES:
+        raise ConfigError(
+            f"{repeat} repetitions of {images} images are {images * repeat} frames, more than {MAX_FRAMES}",
+            hint="repeat less often, or make several scans",
+        )
 
 
 def pattern_for(method: str, given: Mapping[str, Any], axis: Axis, projector: ProjectorSize) -> Pattern:

@@ -155,6 +155,7 @@ def test_a_client_that_vanishes_leaves_its_scan_running(endpoint: str, client: C
         ("laser", {}, "laser"),
         ("pmp", {"pattern": {"frequencies": [1, 500], "shifts": [4, 4]}}, "period"),
         ("pmp", {"pattern": {"method": "mcp"}}, "mcp"),
+        ("pmp", {"pattern": {"frequencies": [1, 2], "shifts": [1000, 1000]}}, "2000 images"),
         ("mcp", {"exposure": 1e9}, "exposure"),
         ("mcp", {"filters": {"depth": [9.0, 1.0]}}, "depth"),
         ("mcp", {"repeat": 0}, "repeat"),
@@ -167,6 +168,15 @@ def test_what_cannot_be_scanned_is_refused_in_words(
         client.scan(method, **params)
     assert caught.value.hint or named in {"depth", "repeat"}
     assert client.list_scans()[-1]["reason"] == "refused"
+
+
+def test_a_long_sequence_can_be_cancelled_before_its_images_are_made(client: Client) -> None:
+    began = time.monotonic()
+    job = client.start_scan("pmp", pattern={"frequencies": [1], "shifts": [1000]}, exposure=1000)
+    client.cancel(job)
+    assert client.wait(job)["state"] == "cancelled"
+    assert client.scan("mcp").xyz is not None
+    assert time.monotonic() - began < 10
 
 
 def test_repeat_and_gray(client: Client) -> None:

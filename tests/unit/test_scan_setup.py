@@ -8,7 +8,7 @@ import pytest
 from scanner.errors import ConfigError, DecodeError
 from scanner.patterns import McpPattern, PatternSequence, PmpPattern, ProjectorSize
 from scanner.patterns.sequence import Precorrection
-from service.scan_setup import METHODS, inverse_table, pattern_for
+from service.scan_setup import METHODS, check_length, inverse_table, pattern_for
 
 SIZES = [(320, 240), (640, 360), (854, 480), (912, 1140), (1152, 864), (1280, 800), (1920, 1080), (3840, 2160)]
 
@@ -45,6 +45,14 @@ def test_what_is_no_method() -> None:
     assert "pmp" in str(caught.value.hint)
     with pytest.raises(ConfigError, match="too small"):
         pattern_for("mcp", {}, "y", ProjectorSize(16, 12))
+
+
+@pytest.mark.parametrize(("images", "repeat", "said"), [(200_000, 1, "images"), (31, 10_000, "310000 frames")])
+def test_a_scan_without_end_is_refused(images: int, repeat: int, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        check_length(images, repeat)
+    check_length(1, 1_000_000)
+    check_length(31, 1000)
 
 
 @pytest.mark.parametrize("gamma", [0.5, 1.0, 2.2])
