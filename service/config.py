@@ -14,20 +14,27 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import ErrorDetails
 
 from drivers.registry import Kind, check_driver
-from scanner.errors import ConfigError
-from scanner.wire import DEFAULT_ENDPOINT
+from scanner.errors import ConfigError, ScannerError
+from scanner.wire import DEFAULT_ENDPOINT, ipc_path
 from service.toml_lines import KeyPath, key_lines
 from service.toml_text import to_toml
 
 DEFAULT_SIMULATED = "casey2011/bust"
 
 MAX_FILE_BYTES = 1 << 20
-MAX_SOCKET_PATH = 107
-"""Bytes in the path of a Unix socket (unix(7)); libzmq says only "invalid argument" beyond it."""
 
 
 def load_rig(name: str | Path) -> RigConfig:
@@ -37,7 +44,7 @@ def load_rig(name: str | Path) -> RigConfig:
         ConfigError: the file cannot be read, or holds errors: all of them, one a line.
     """
     text = str(name)
-    if text == "simulated" or text.startswith("simulated:"):
+    if is_simulated(text):
         return simulated_rig(text.removeprefix("simulated").removeprefix(":") or DEFAULT_SIMULATED)
     rig, problems = check_rig(Path(name))
     if rig is None:
@@ -46,6 +53,11 @@ def load_rig(name: str | Path) -> RigConfig:
             hint="fringed check-config FILE checks a rig file; the documentation lists every key (rig-file)",
         )
     return rig
+
+
+def is_simulated(name: str) -> bool:
+    """Whether a rig's name means the built-in one, and no file."""
+    return name == "simulated" or name.startswith("simulated:")
 
 
 def simulated_rig(device: str = DEFAULT_SIMULATED) -> RigConfig:
@@ -66,9 +78,11 @@ def check_rig(path: Path) -> tuple[RigConfig | None, list[Problem]]:
     text = _read(path)
     try:
         content = tomllib.loads(text)
+        lines = key_lines(text)
     except tomllib.TOMLDecodeError as error:
         return None, [Problem(str(path), _line_in(str(error)), "", None, f"TOML: {error}")]
-    lines = key_lines(text)
+    except RecursionError:
+        return None, [Problem(str(path), None, "", None, "nested too deeply for a rig file")]
     try:
         rig = RigConfig.model_validate(content, context={"folder": path.absolute().parent, "stem": path.stem})
     except ValidationError as error:
@@ -119,14 +133,28 @@ def _path(value: Any, info: ValidationInfo) -> Any:
     """A path, relative to the rig file."""
     if not isinstance(value, str) or not value:
         return value
-    return (info.context or {}).get("folder", Path()) / Path(value).expanduser()
+    if "\0" in value:
+        raise ValueError("no file has such a name")
+    try:
+        return (info.context or {}).get("folder", Path()) / Path(value).expanduser()
+    except RuntimeError as error:  # "~name" without such a user, "~" without a home
+        raise ValueError(str(error)) from error
+
+
+def _endpoint(value: str) -> str:
+    try:
+        ipc_path(value)
+    except ScannerError as error:
+        raise ValueError(error.message) from error
+    return value
 
 
 RelativePath = Annotated[Path, BeforeValidator(_path)]
 Microseconds = Annotated[float, Field(ge=0, le=10_000_000)]
 MicrosecondRange = Annotated[tuple[Microseconds, Microseconds], BeforeValidator(_range)]
 Pixel = Annotated[int, Field(ge=0, le=65_535)]
-Region = Annotated[tuple[Pixel, Pixel, Pixel, Pixel], BeforeValidator(_tuple)]
+PixelCount = Annotated[int, Field(ge=1, le=65_535)]
+Region = Annotated[tuple[Pixel, Pixel, PixelCount, PixelCount], BeforeValidator(_tuple)]
 
 
 class _Table(BaseModel):
@@ -153,7 +181,9 @@ class CameraSettingsConfig(_Table):
     )
     gain_db: float | None = Field(default=None, ge=0, le=48, description="gain in dB, 0 .. 48")
     pixel_format: str | None = Field(default=None, min_length=1, description='a pixel format of the camera, as "Mono8"')
-    region: Region | None = Field(default=None, description="[x, y, width, height] in sensor pixels")
+    region: Region | None = Field(
+        default=None, description="[x, y, width, height] in sensor pixels, width and height 1 or more"
+    )
     trigger_mode: Literal["software", "free"] | None = Field(
         default=None, description='"software" or "free" (free run); leave it out to let the planner choose'
     )
@@ -216,11 +246,9 @@ class RetentionConfig(_Table):
 class DaemonConfig(_Table):
     """`[daemon]`."""
 
-    endpoint: str = Field(
+    endpoint: Annotated[str, AfterValidator(_endpoint)] = Field(
         default=DEFAULT_ENDPOINT,
-        pattern=r"^ipc://.+",
-        max_length=len("ipc://") + MAX_SOCKET_PATH,
-        description=f"ipc:// and the path of a socket, {MAX_SOCKET_PATH} bytes at most (no TCP before encryption)",
+        description="ipc:// and the absolute path of a socket, 100 bytes at most (no TCP before encryption)",
     )
     spool: RelativePath | None = Field(default=None, description="path of the folder that captures are written to")
     spool_limit_gb: float | None = Field(default=None, gt=0, le=1_000_000, description="gigabytes, more than 0")
@@ -294,10 +322,23 @@ def _unusable(rig: RigConfig, content: Mapping[str, Any], lines: Mapping[KeyPath
         except ConfigError as error:
             expected = f"{error.message}; {error.hint}"
             yield Problem(file, _line_of(path, lines), ".".join(path), _value_at(content, path), expected)
-    if rig.rig.calibration is not None and not rig.rig.calibration.is_file():
-        place = ("rig", "calibration")
-        expected = f"there is no file {rig.rig.calibration}"
-        yield Problem(file, _line_of(place, lines), ".".join(place), _value_at(content, place), expected)
+    places: tuple[tuple[KeyPath, Path | None], ...] = (
+        (("rig", "calibration"), rig.rig.calibration),
+        (("daemon", "spool"), rig.daemon.spool),
+    )
+    for place, named in places:
+        if named is not None and (wrong := _wrong_path(named, folder=place[-1] == "spool")):
+            yield Problem(file, _line_of(place, lines), ".".join(map(str, place)), _value_at(content, place), wrong)
+
+
+def _wrong_path(path: Path, *, folder: bool) -> str:
+    """Why a path does not serve as a file, or as a folder that may yet be made; empty where it does."""
+    try:
+        if folder:
+            return f"{path} is not a folder" if path.exists() and not path.is_dir() else ""
+        return "" if path.is_file() else f"there is no file {_cut(str(path))}"
+    except OSError as error:
+        return f"cannot be looked at: {error.strerror}"
 
 
 def _in_document(detail: ErrorDetails, lines: Mapping[KeyPath, int]) -> KeyPath:
@@ -376,6 +417,10 @@ def _short(value: Any) -> str:
     return shown if len(shown) <= 60 else shown[:57] + "..."
 
 
+def _cut(text: str) -> str:
+    return text if len(text) <= 120 else text[:117] + "..."
+
+
 def _line_in(message: str) -> int | None:
     """The line in a message of tomllib: "... (at line 3, column 7)"."""
     _, found, rest = message.rpartition("(at line ")
@@ -392,4 +437,4 @@ def _read(path: Path) -> str:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not text in UTF-8, so it is no rig file") from error
     except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+        raise ConfigError(f"cannot read {_cut(str(path))}: {error.strerror}") from error

@@ -5,6 +5,7 @@ What each command does stands in `service.commands`; they import devices, arrays
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import tempfile
@@ -15,7 +16,7 @@ from typing import Annotated, Any
 
 import typer
 
-from scanner.errors import ScannerError
+from scanner.errors import ScannerError, StorageError
 from service.commands import audit, check_config, daemon, decode, devices, patterns, scan
 from service.terminal import error_document, print_error, print_json
 
@@ -71,10 +72,12 @@ def _run(words: list[str], as_json: bool) -> int:
         status = int(app(words, prog_name="fringed", standalone_mode=False) or 0)
         return _interrupted(as_json) if status == INTERRUPTED else status  # newer typers return it, older ones raise
     except ScannerError as error:
-        print_error(str(error), error.hint)
-        if as_json:
-            print_json(error_document(error))
-        return FAILED
+        return _failed(error, as_json)
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        # Whichever argument it was: every look at such a path says so.
+        return _failed(StorageError(f"{str(error.filename)[:60]}...: {error.strerror}"), as_json)
     except _UsageError as error:
         context = getattr(error, "ctx", None)
         path = context.command_path if context is not None else "fringed"
@@ -85,6 +88,13 @@ def _run(words: list[str], as_json: bool) -> int:
         return WRONG_USAGE
     except (KeyboardInterrupt, typer.Abort):
         return _interrupted(as_json)
+
+
+def _failed(error: ScannerError, as_json: bool) -> int:
+    print_error(str(error), error.hint)
+    if as_json:
+        print_json(error_document(error))
+    return FAILED
 
 
 def _interrupted(as_json: bool) -> int:

@@ -13,6 +13,7 @@ from drivers.simulated.scenes import scene_names
 from drivers.simulated.world import enter_world
 from scanner.clock import Clock
 from scanner.devices import DeviceInfo
+from scanner.errors import ConfigError
 
 DRIVER = "simulated"
 
@@ -41,8 +42,16 @@ class SimulatedProjectorDriver:
 
     def open(self, device: str, options: Mapping[str, Any], clock: Clock) -> SimulatedProjector:
         """Open the projector of a simulated world; see `SimulatedCameraDriver.open`."""
-        settings = read_settings(device, options, "projector")
+        mode = options.get("mode")
+        settings = read_settings(device, {k: v for k, v in options.items() if k != "mode"}, "projector")
         name = _name(settings.world.rig, settings.world.scene, "projector")
+        width, height = rig(settings.world.rig).calibration.projector.size
+        if mode is not None and str(mode).partition("@")[0] != f"{width}x{height}":
+            raise ConfigError(
+                f"the simulated projector has one mode, {width}x{height}, and not {mode}",
+                device=name,
+                hint="leave projector.mode out; another rig of `fringed devices` has another projector",
+            )
         return SimulatedProjector(enter_world(settings, clock, name), settings, name)
 
     def discover(self) -> Sequence[DeviceInfo]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.commands.options import AsJson, Force
+from service.commands.options import AsJson, Force, output_path
 from service.terminal import print_error, print_facts, print_json, print_table, progress_lines
 
 if TYPE_CHECKING:
@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 def audit(
     capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture folder, or its JSON file.")],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Draw the timing diagram: .svg or .png.")
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="FILE", parser=output_path, help="Draw the timing diagram: .svg or .png."
+        ),
     ] = None,
     force: Force = False,
     as_json: AsJson = False,

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 
 def check_config(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A rig file (TOML).")], as_json: AsJson = False
+    file: Annotated[str, typer.Argument(metavar="FILE", help="A rig file (TOML), or simulated[:SCENE].")],
+    as_json: AsJson = False,
 ) -> int:
     """Check a rig file: keys, values, drivers, calibration. Opens no device.
 
@@ -24,9 +25,9 @@ def check_config(
     Examples:
       fringed check-config bench.toml
     """
-    from service.config import check_rig  # noqa: PLC0415
+    from service.config import check_rig, is_simulated, load_rig  # noqa: PLC0415
 
-    rig, problems = check_rig(file)
+    rig, problems = (load_rig(file), []) if is_simulated(file) else check_rig(Path(file))
     lines = [str(problem) for problem in problems]
     if rig is not None:
         lines += _calibration_problems(rig, file)
@@ -47,7 +48,7 @@ def check_config(
     return 0
 
 
-def _calibration_problems(rig: RigConfig, file: Path) -> list[str]:
+def _calibration_problems(rig: RigConfig, file: str) -> list[str]:
     if rig.rig.calibration is None:
         return []
     from scanner.errors import CalibrationError  # noqa: PLC0415

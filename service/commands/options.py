@@ -15,8 +15,17 @@ import typer
 
 from scanner.errors import ConfigError
 
+
+def output_path(text: str) -> Path:
+    """A place to write to. Nothing at all is a shell's empty variable, and not the working directory."""
+    if not text:
+        raise typer.BadParameter("-o: expected a path, got nothing")
+    return Path(text)
+
+
 OutputFolder = Annotated[
-    Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder to write to; refused unless empty.")
+    Path | None,
+    typer.Option("-o", "--output", metavar="DIR", parser=output_path, help="Folder to write to; refused unless empty."),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Write into a folder that is not empty.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output, and nothing else.")]

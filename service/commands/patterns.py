@@ -19,6 +19,7 @@ from service.commands.options import (
     PatternOptions,
     Profile,
     Shifts,
+    output_path,
 )
 from service.terminal import print_facts, print_json, progress_lines
 
@@ -30,7 +31,9 @@ PATTERN_FILE = "pattern.json"
 
 def patterns(
     method: Annotated[Method, typer.Argument(metavar="METHOD", help="pmp, mcp or gray.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write to.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", parser=output_path, help="Folder to write to.")
+    ],
     size: Annotated[str, typer.Option(metavar="WxH", help="The projector's size, pixels.")] = "1152x864",
     frequencies: Frequencies = None,
     shifts: Shifts = None,

@@ -131,9 +131,10 @@ def _exposure(text: str) -> float | Literal["auto"]:
 @contextmanager
 def _output(folder: Path, *, force: bool) -> Iterator[None]:
     """The output folder; one that was made for a scan that fails is removed again."""
-    from scanner.storage import prepare_output  # noqa: PLC0415
+    from scanner.storage import prepare_output, storage_errors  # noqa: PLC0415
 
-    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    with storage_errors(folder):
+        new = [path for path in (folder, *folder.parents) if not path.exists()]
     prepare_output(folder, force=force)
     try:
         yield

@@ -215,6 +215,33 @@ def test_check_config_says_what_a_rig_file_means_or_all_that_is_wrong(run: Run, 
     assert (status, [problem["line"] for problem in json.loads(out)["problems"]]) == (1, [2, 3, 3])
 
 
+def test_check_config_takes_what_the_daemon_takes(run: Run) -> None:
+    status, out, err = run("check-config", "simulated:quick/board")
+    assert (status, err) == (0, "")
+    assert "quick/board" in out
+
+
+@pytest.mark.parametrize("words", [("scan",), ("decode", "x"), ("patterns", "pmp"), ("audit", "x")])
+def test_an_empty_output_is_wrong_usage(words: tuple[str, ...], run: Run, tmp_path: Path) -> None:
+    status, _, err = run(*words, "-o", "")
+    assert status == 2
+    assert "got nothing" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_that_no_file_can_have_is_refused_in_words(run: Run, capture: Path) -> None:
+    for words in (("scan", "--rig", "simulated:quick/board"), ("decode", capture), ("patterns", "pmp")):
+        status, _, err = run(*words, "-o", 300 * "x")
+        assert status == 1
+        assert "File name too long" in err
+    assert run("check-config", 5000 * "x")[0] == 1
+
+
+def test_the_module_is_a_program_too() -> None:
+    ran = subprocess.run([sys.executable, "-m", "service.cli", "--version"], capture_output=True, text=True, check=True)
+    assert ran.stdout.startswith("fringed ")
+
+
 def test_check_config_opens_the_calibration(run: Run, tmp_path: Path) -> None:
     (tmp_path / "broken.json").write_text("{")
     (tmp_path / "rig.toml").write_text(

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scanner.errors import ConfigError
-from service.config import MAX_SOCKET_PATH, RigConfig, check_rig, load_rig
+from service.config import RigConfig, check_rig, load_rig
 from service.toml_lines import key_lines
 from service.toml_text import to_toml
 
@@ -163,7 +163,14 @@ def test_all_errors_come_at_once_in_order_of_lines(rig_file: Path) -> None:
         ("projector", "rotate = 90", "upside down"),
         ("projector", "options = 3", "driver's own options"),
         ("daemon", 'endpoint = "tcp://127.0.0.1:5000"', "no TCP"),
-        ("daemon", f'endpoint = "ipc:///{"x" * MAX_SOCKET_PATH}"', "107 bytes"),
+        ("daemon", f'endpoint = "ipc:///{"x" * 100}"', "100 bytes"),
+        ("daemon", f'endpoint = "ipc:///{"ä" * 50}"', "100 bytes"),
+        ("daemon", 'endpoint = "ipc://x"', "absolute path"),
+        ("daemon", 'spool = "~nobodyx/x"', "path of the folder"),
+        ("daemon", 'spool = "/dev/null"', "is not a folder"),
+        ("rig", 'calibration = "~nobodyx/x"', "path of a calibration"),
+        ("rig", f'calibration = "{"x" * 5000}"', "File name too long"),
+        ("camera", "settings.region = [0, 0, 0, 0]", "1 or more"),
         ("daemon", "workers = -1", "0 .. 64"),
         ("daemon", "spool_limit_gb = 0", "more than 0"),
         ("daemon", "retention = 5", "[daemon.retention]"),
@@ -192,6 +199,8 @@ def test_what_a_rig_names_must_be_there(rig_file: Path) -> None:
 
 def test_files_that_are_no_rig_files(rig_file: Path, tmp_path: Path) -> None:
     assert f"{rig_file}:2: TOML:" in refusal(rig_file, "[rig]\nname = \n")
+    assert "nested too deeply" in refusal(rig_file, "a = " + 3000 * "[" + 3000 * "]")
+    assert "nested too deeply" in refusal(rig_file, "a = " + 3000 * "[")
     for content, expected in ((b"\xff\xfe\x00", "UTF-8"), (b"#" * (1 << 21), "larger")):
         rig_file.write_bytes(content)
         with pytest.raises(ConfigError, match=expected):

@@ -328,3 +328,10 @@ def test_the_camera_knows_the_truth() -> None:
     bench = Bench("quick/sphere_board")
     assert isinstance(bench.camera, KnowsTruth)
     assert bench.camera.true_calibration().camera.size == (320, 240)
+
+
+def test_the_projector_has_one_mode() -> None:
+    clock = VirtualClock()
+    with pytest.raises(ConfigError, match="one mode, 320x240"):
+        projector_driver.open("quick/board", {"mode": "640x480"}, clock)
+    projector_driver.open("quick/board", {"mode": "320x240@60"}, clock).close()
