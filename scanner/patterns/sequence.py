@@ -103,7 +103,7 @@ class PatternSequence:
         axes: tuple[Axis, ...] = getattr(pattern, "axes", ())
         white, black = (before, before + 1) if pattern.method == "gray" else (None, None)
         first = before + (2 if white is not None else 0) + pattern.fringe_count
-        bars = {axis: first + i for i, axis in enumerate(axes)} if pattern.method == "pmp" else {}
+        bars = {axis: first + i for i, axis in enumerate(axes)} if pattern.method in ("pmp", "gray") else {}
         end = first + len(bars)
         sentinels = (*range(before), *range(end, end + after))
         return cls(projector, pattern, white, black, sentinels, bars, precorrection)

@@ -16,7 +16,7 @@ from scanner.errors import DecodeError, DeviceLost, SyncError
 from scanner.patterns import PatternSequence, PmpPattern
 from scanner.reconstruct import raise_if_empty, reconstruct
 from scanner.sequencer import FinishReason, check_capture
-from tests.unit.sequencer_bench import Taken, pmp, take
+from tests.unit.sequencer_bench import Taken, gray, pmp, take
 
 EIGHT = pmp((1.0, 8.0), (8, 8))
 THREE = pmp((1.0, 8.0), (3, 3))
@@ -215,6 +215,18 @@ def test_frames_are_told_as_they_are_recorded() -> None:
     assert told[-1][0] == 3
     assert told[0] == (0, 128)
     assert len(told) == len(taken.acquisition.records)
+
+
+@pytest.mark.parametrize("order", ["swap:5,6", "swap:7,8", "rotate:5,16,2", "swap:19,20"])
+def test_gray_code_out_of_order_is_a_sync_error_and_mended_where_it_passes(order: str) -> None:
+    sequence = gray(bits=8)
+    error = take(sequence, f"projector.order={order}").acquisition.error
+    assert isinstance(error, SyncError)
+    assert set(error.frames) <= set(sequence.fringes)
+    taken = take(sequence, f"projector.order={order}&times=2")
+    assert taken.acquisition.reason is FinishReason.COMPLETED
+    assert taken.acquisition.retakes > 0
+    assert np.median(taken.error_px()) < 1
 
 
 # --- from the folder ----------------------------------------------------------------------------------------------

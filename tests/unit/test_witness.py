@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import random
 from functools import cache
+from typing import Literal
 
 import numpy as np
 import pytest
 
 from scanner.devices import Pixels
-from scanner.patterns import PatternSequence, PmpPattern
+from scanner.patterns import GrayPattern, PatternSequence, PmpPattern
+from scanner.patterns.description import Axis
 from scanner.sequencer import Witnesses, witness
 from tests.unit.sequencer_bench import QUICK, Taken, gray, pmp, take
 
@@ -220,6 +222,79 @@ def test_gray_pairs_that_are_no_inverses_are_named() -> None:
     capture = take(gray())
     a = capture.sequence.fringes[4]
     assert set(questioned(capture, {a + 1: a}).suspects) == {a, a + 1}
+
+
+@cache
+def gray_taken(scene: str, axes: tuple[Axis, ...] = ("y",), bits: int = 8) -> Taken:
+    code_bits = 8 if axes == ("y",) else 9
+    return take(PatternSequence.bracketed(QUICK, GrayPattern(axes, bits, code_bits)), scene=scene)
+
+
+@pytest.mark.parametrize("scene", ["board", "bust", "blocks"])
+def test_every_bit_of_gray_code_exchanged_with_its_inverse_is_named(scene: str) -> None:
+    capture = gray_taken(scene)
+    fringes = capture.sequence.fringes
+    for a, b in zip(fringes[::2], fringes[1::2], strict=True):
+        assert questioned(capture, {a: b, b: a}).suspects == (a, b)
+
+
+def test_code_frames_turned_round_or_reversed_are_named() -> None:
+    capture = gray_taken("board")
+    fringes = capture.sequence.fringes
+    for count in (12, 16):
+        order = {fringes[i]: fringes[(i + 2) % count] for i in range(count)}
+        assert questioned(capture, order).suspects == fringes[:count]
+    assert questioned(capture, dict(zip(fringes, fringes[::-1], strict=True))).suspects == fringes
+    a, b = fringes[12:14], fringes[14:16]
+    found = questioned(capture, dict(zip((*a, *b), (*b, *a), strict=True)))
+    assert found.suspects == (*a, *b)
+    assert "smooth" in found.items[-1].says
+
+
+def test_the_coarsest_bit_needs_the_bars_and_without_them_it_is_said() -> None:
+    capture = gray_taken("board", ("x", "y"))
+    bare = PatternSequence(QUICK, capture.sequence.pattern)
+    fringes = capture.sequence.fringes
+    found = witness(bare, {i: capture.thumbnails[p] for i, p in enumerate(fringes)}, 255)
+    assert found.passed
+    assert sum("no order bars" in text for text in found.cannot_reveal) == 2
+    assert "no order bars" not in str(gray_taken("board", ("x", "y")).acquisition.witnesses.cannot_reveal)
+    a, b = fringes[18:20]
+    assert questioned(capture, {a: b, b: a}).suspects == (a, b)
+
+
+@pytest.mark.parametrize("bit", range(7))
+def test_a_pair_of_code_frames_that_is_the_next_one_again_is_named(bit: int) -> None:
+    capture = gray_taken("board")
+    own, later = (capture.sequence.fringes[2 * b : 2 * b + 2] for b in (bit, bit + 1))
+    assert set(questioned(capture, dict(zip(own, later, strict=True))).suspects) >= set(own)
+
+
+def test_a_frame_of_bars_that_shows_none_is_named() -> None:
+    capture = gray_taken("board")
+    bars = capture.sequence.bars["y"]
+    assert questioned(capture, {bars: capture.sequence.sentinels[0]}).suspects == (bars,)
+
+
+@pytest.mark.parametrize("bits", [3, 5, 8])
+@pytest.mark.parametrize("code", ["gray", "binary"])
+def test_few_bits_and_binary_code_are_not_accused(bits: int, code: Literal["gray", "binary"]) -> None:
+    sequence = PatternSequence.bracketed(QUICK, GrayPattern(("y",), bits, 8, code))
+    found = take(sequence, scene="sphere_board").acquisition
+    assert found.witnesses.passed, found.witnesses.items
+    assert found.retakes == 0
+
+
+@pytest.mark.parametrize(
+    "faults", ["full_well_e=2000&read_noise_dn=2", "ambient=0.5", "gamma=2.6", "bits=12", "exposure"]
+)
+@pytest.mark.parametrize("scene", ["textured", "bust"])
+def test_hard_conditions_are_no_disorder_of_gray_code(scene: str, faults: str) -> None:
+    exposure_ns, faults = (60_000_000, "") if faults == "exposure" else (12_500_001, faults)
+    for inverse in (True, False):
+        found = take(gray(8, inverse), faults, scene=scene, exposure_ns=exposure_ns).acquisition
+        assert found.witnesses.passed, found.witnesses.items
+        assert found.retakes == 0
 
 
 def test_white_and_black_exchanged() -> None:
