@@ -141,14 +141,14 @@ class _Series:
             self._reconstruction = Reconstruction(self._header, calibration_for(capture), options)
 
     def frame(self, message: Frame) -> None:
-        """Take one frame.
+        """Take one frame; one whose pixels are not those that were written is missing, here as to later readers.
 
         Raises:
-            DecodeError: its pixels are not those that were written.
+            DecodeError: the spool cannot be read.
         """
         if message.slot is not None and message.status == "ok":
             pixels = self._frames.at(message)
-            if self._reconstruction is not None:
+            if pixels is not None and self._reconstruction is not None:
                 self._reconstruction.add(message.pattern, pixels, message.slot)
         self._taken += 1
         if self._taken % ACK_EVERY == 0:
@@ -205,11 +205,11 @@ class _MappedFrames:
         self._map: NDArray[np.uint8] | None = None
         self._path = ""
 
-    def at(self, message: Frame) -> NDArray[Any]:
-        """A frame's pixels, (H, W), read-only, no copy.
+    def at(self, message: Frame) -> NDArray[Any] | None:
+        """A frame's pixels, (H, W), read-only, no copy; None where their digest differs (formats.md, Capture).
 
         Raises:
-            DecodeError: they are not there, or their digest differs.
+            DecodeError: they are not there.
         """
         from scanner.capture import digest_matches  # noqa: PLC0415
 
@@ -224,7 +224,8 @@ class _MappedFrames:
             raise DecodeError(f"{message.path}: pattern {message.pattern} lies beyond the end of the file")
         pixels = self._map[message.offset : end].view(self._camera.dtype).reshape(self._camera.shape)
         if not digest_matches(pixels, message.xxh3):
-            raise DecodeError(f"{message.path}: the digest of pattern {message.pattern} differs: the spool is damaged")
+            _log.warning("%s: the digest of pattern %d differs: taken as missing", message.path, message.pattern)
+            return None
         return pixels
 
     def close(self) -> None:
