@@ -30,6 +30,9 @@ BLACK, WHITE = 0, 1
 HOST_SLACK_NS = 500_000_000
 """A frame that has not come so long after it was due is lost."""
 
+SHOTS = 3
+"""A shot of steady light is tried so often: where one frame in ten is lost, one shot in a thousand fails."""
+
 
 @dataclass(frozen=True, eq=False)
 class Shot:
@@ -99,13 +102,15 @@ class Shots:
         return self.projector.show(min(image, self.images - 1))
 
     def steady(self, image: int) -> Shot:
-        """A frame of an image that certainly shines.
+        """A frame of an image that certainly shines; one that is lost or comes in part is taken again.
 
         Raises:
-            DeviceError: no frame came.
+            DeviceError: none of SHOTS came.
         """
-        flip = self.show(image)
-        return self.after(flip, self.light_delay_ns)
+        for _ in range(SHOTS - 1):
+            if (shot := self._taken(self.show(image), self.light_delay_ns)) is not None:
+                return shot
+        return self.after(self.show(image), self.light_delay_ns)
 
     def after(self, flip: Flip, delay_ns: int) -> Shot:
         """The frame whose exposure begins `delay_ns` after a flip (software trigger), or the first one later.
@@ -113,23 +118,28 @@ class Shots:
         Raises:
             DeviceError: no frame came.
         """
+        if (shot := self._taken(flip, delay_ns)) is None:
+            raise DeviceError(
+                "no frame came for a test shot", device=self.camera.name, hint="is another program using the camera?"
+            )
+        return shot
+
+    def _taken(self, flip: Flip, delay_ns: int) -> Shot | None:
         due = flip.t_ns + delay_ns
         if self.mode is TriggerMode.SOFTWARE:
             latency = self.camera.capabilities.trigger_latency or Interval(0, 0)
             self.clock.sleep_until(due - latency.low_ns)
             self.camera.trigger()
         frame = self._pop(due if self.mode is TriggerMode.FREE else flip.t_ns)
-        return Shot(thumbnail(frame.pixels), frame.exposure, flip)
+        return None if frame is None else Shot(thumbnail(frame.pixels), frame.exposure, flip)
 
-    def _pop(self, earliest_ns: int) -> CameraFrame:
+    def _pop(self, earliest_ns: int) -> CameraFrame | None:
         caps = self.camera.capabilities
         until = self.clock.now_ns() + caps.min_period_ns(self.exposure_ns) * 2 + caps.readout_ns + HOST_SLACK_NS
         while (frame := self.camera.pop(max(0, until - self.clock.now_ns()))) is not None:
             if frame.complete and frame.exposure.start_ns + frame.exposure.bound_ns >= earliest_ns:
                 return frame
-        raise DeviceError(
-            "no frame came for a test shot", device=self.camera.name, hint="is another program using the camera?"
-        )
+        return None
 
 
 def declared_delay_ns(projector: Projector) -> int:

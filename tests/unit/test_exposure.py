@@ -9,6 +9,7 @@ import pytest
 from drivers.registry import open_camera, open_projector
 from scanner.clock import VirtualClock
 from scanner.devices import TriggerMode
+from scanner.errors import DeviceError
 from scanner.sequencer import ExposureChoice, auto_exposure
 from scanner.sequencer.exposure import CEILING, LONGEST_NS
 
@@ -34,6 +35,17 @@ def test_white_comes_near_the_target_in_whole_modulation_periods(mode: TriggerMo
     assert 0.75 < choice.level <= CEILING
     assert "modulation period" in choice.note
     assert choice.warning is None
+
+
+@pytest.mark.parametrize("fault", ["drop", "incomplete"])
+def test_a_test_shot_that_is_lost_is_taken_again(fault: str) -> None:
+    assert chosen(f"&{fault}=0&times=1").exposure_ns == chosen().exposure_ns
+
+
+def test_a_camera_that_sends_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.simulated.camera.SimulatedCamera.pop", lambda camera, timeout_ns: None)
+    with pytest.raises(DeviceError, match="no frame came"):
+        chosen()
 
 
 def test_whole_refreshes_where_no_modulation_is_known() -> None:
