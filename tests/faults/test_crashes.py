@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -248,6 +249,22 @@ async def daemon_here(state: Path, **options: Any) -> AsyncIterator[tuple[AsyncC
     finally:
         served.stop()
         await serving
+
+
+async def test_a_disk_that_fills_in_mid_run_fails_the_scan_and_not_the_daemon(tmp_path: Path) -> None:
+    async with daemon_here(tmp_path) as (client, devices):
+        job = await client.start_scan("pmp", repeat=3)
+        async for event in client.events(job):
+            if event.kind == "frame":
+                # The system refuses every write beyond the sixth frame, as it does when nothing is left.
+                no_room = (500_000, resource.RLIM_INFINITY)
+                before = resource.prlimit(devices(), resource.RLIMIT_FSIZE, no_room)
+                break
+        outcome = await client.wait(job)
+        assert (outcome["state"], outcome["reason"]) == ("failed", "disk_full")
+        assert "File too large" in outcome["error"]["message"]
+        resource.prlimit(devices(), resource.RLIMIT_FSIZE, before)
+        assert (await client.scan("mcp")).xyz is not None
 
 
 @pytest.mark.parametrize(
