@@ -386,7 +386,7 @@ def calibration(**changes: Any) -> dict[str, Any]:
         "format": "fringed-calibration",
         "version": 1,
         "camera": lens,
-        "projector": lens,
+        "projector": {**lens, "size": [96, 64]},
         "rotation": turned,
         "translation": [0, 50, 0],
         **changes,
@@ -397,6 +397,7 @@ def calibration(**changes: Any) -> dict[str, Any]:
     "changes",
     [
         {"camera": {**calibration()["camera"], "size": [640, 480]}},
+        {"projector": {**calibration()["projector"], "size": [96, 128]}},
         {"camera": {**calibration()["camera"], "matrix": [[0, 0, 0], [0, 0, 0], [0, 0, 1]]}},
         {"rotation": [[float("nan"), 0, 0], [0, 1, 0], [0, 0, 1]]},
         {"rotation": [[1, 0, 0], [1, 0, 0], [0, 0, 1]]},
