@@ -140,7 +140,11 @@ class TableSlot:
     bit_planes: int = 8
     colour: Literal["white", "red", "green", "blue"] = "white"
     wait_trigger: bool = False
+    """a board: it begins at an edge of the source; else when the slot before it ends"""
     emit_trigger: bool = True
+    edges: int = 1
+    """with `wait_trigger` on a board: it begins at this edge, counted from the one that began the waiting slot before
+    (the first slot: from arming); 2 is a pattern that stays on for two refreshes"""
 
 
 @runtime_checkable
@@ -187,6 +191,8 @@ class CameraCapabilities:
     trigger_modes: frozenset[TriggerMode]
     trigger_latency: Interval | None = None
     """software trigger call to first row's start"""
+    line_latency: Interval | None = None
+    """edge on the trigger line to first row's start (mode HARDWARE)"""
     stamp: Source = Source.ESTIMATED
     stamp_bound_ns: int = 1_000_000
     gain_min_db: float = 0.0
@@ -228,7 +234,8 @@ class CameraFrame:
     exposure: Exposure
     complete: bool = True
     trigger: int | None = None
-    """number of the trigger that started it, where the device counts them"""
+    """number of the trigger that started it, from 0 at `start`, where the device counts them; those that a busy
+    camera dropped are counted too"""
 
 
 @runtime_checkable
@@ -282,41 +289,111 @@ class TriggerSource(StrEnum):
 
 
 @dataclass(frozen=True)
+class TriggerCapabilities:
+    """What a trigger board can do. A slot is dark for `dark_us`, then its pulse lasts `exposure_us`."""
+
+    sources: frozenset[TriggerSource]
+    max_steps: int
+    """steps in its memory; a longer table must be repetitions of so many: see `scanner.trigger_table`"""
+    max_repeats: int
+    dark_min_us: int
+    """shortest dark time of a slot: from the edge that begins it, or the end of the slot before"""
+    exposure_min_us: int
+    time_max_us: int
+    """longest dark time and longest exposure"""
+    jitter_ns: int
+    """a pulse begins within +- this of its edge plus its dark time"""
+
+
+@dataclass(frozen=True)
 class TriggerEvent:
     """One exposure pulse that a board gave."""
 
     sequence: int
+    """number of the run: how often the board was armed since it was opened, from 0"""
     step: int
+    """position of the slot in the table that was programmed"""
     t_ns: int
+    """when the pulse began"""
     bound_ns: int
     source: Source
 
 
+@dataclass(frozen=True)
+class TriggerFault:
+    """What a board reported about the run since `arm`. All but `lost_events` end it, outputs low."""
+
+    kind: Literal["missing_edge", "overrun", "lost_events", "reset"]
+    """no edge within the board's time-out; an edge came that should have begun a slot while another ran; pulses came
+    whose events did not; the board began anew"""
+    message: str
+    step: int | None = None
+    """position of the slot concerned, in the table that was programmed"""
+    t_ns: int | None = None
+
+
 @runtime_checkable
 class TriggerBoard(Protocol):
-    """A board that runs a table of exposures on its own timer; the host never times a frame."""
+    """A board that runs a table of exposures on its own timer; the host never times a frame.
+
+        idle --program--> idle --arm--> armed --first edge, or fire--> running --last slot over, abort, fault--> idle
+
+    The last slot's end is not reported: it is known from its event. Opened by its driver's `open`, outputs low.
+    """
 
     @property
     def name(self) -> str:
         """The device's name in messages."""
 
+    @property
+    def capabilities(self) -> TriggerCapabilities:
+        """What it can do."""
+
     def program(self, table: Sequence[TableSlot], source: TriggerSource) -> None:
-        """Load the whole table."""
+        """Load the whole table, while idle.
+
+        Source INTERNAL: slots follow one another from `fire` on, and none may have `wait_trigger`. VSYNC, EXTERNAL:
+        the first slot has it.
+
+        Raises:
+            ConfigError: a slot outside the capabilities, named with its bounds; a table that does not fit.
+            DeviceBusy: a run is under way.
+        """
 
     def arm(self) -> None:
-        """Wait for the source."""
+        """Wait for the source; events and faults from before are gone. Edges count from when this returns at latest.
+
+        Raises:
+            DeviceError: nothing is programmed.
+            DeviceBusy: a run is under way.
+        """
 
     def fire(self) -> None:
-        """Start the table now (source INTERNAL)."""
+        """Start the table now (source INTERNAL).
+
+        Raises:
+            DeviceError: the board is not armed, or its source is another.
+        """
 
     def abort(self) -> None:
-        """Stop, outputs low."""
+        """Stop, outputs low. Always works; the board is idle after it and keeps its table."""
 
     def events(self) -> Sequence[TriggerEvent]:
-        """Pulses given since `arm`, in order."""
+        """Pulses given since `arm`, in order. Those of the last milliseconds may still be on their way.
+
+        Raises:
+            DeviceLost: the board went away.
+        """
+
+    def faults(self) -> Sequence[TriggerFault]:
+        """What went wrong since `arm`, in order.
+
+        Raises:
+            DeviceLost: the board went away.
+        """
 
     def close(self) -> None:
-        """Give the device back. May be called twice."""
+        """Abort and give the device back. May be called twice."""
 
 
 # --- drivers ----------------------------------------------------------------------------------------------------

@@ -1,14 +1,16 @@
-"""Simulated devices: a world in time with a scene, a projector and a camera, and the faults that real ones have.
+"""Simulated devices: a world in time with a scene, projector, camera and trigger board, and the faults of real ones.
 
 Device strings and options: `options`. Rigs and scenes: scenes.json, `rigs`, `scenes`, `targets`. The registry opens
-`camera_driver` and `projector_driver`; nothing else of this package is meant to be imported at run time.
+`camera_driver`, `projector_driver` and `trigger_driver`; nothing else of this package is meant to be imported at run
+time.
 """
 
 from drivers.simulated import cast, optics, sensor, textures, view
-from drivers.simulated.driver import SimulatedCameraDriver, SimulatedProjectorDriver
+from drivers.simulated.driver import SimulatedCameraDriver, SimulatedProjectorDriver, SimulatedTriggerDriver
 
 camera_driver = SimulatedCameraDriver()
 projector_driver = SimulatedProjectorDriver()
+trigger_driver = SimulatedTriggerDriver()
 
 
 def warm_up() -> None:
@@ -20,4 +22,4 @@ def warm_up() -> None:
     view.warm_up()
 
 
-__all__ = ["camera_driver", "projector_driver", "warm_up"]
+__all__ = ["camera_driver", "projector_driver", "trigger_driver", "warm_up"]

@@ -3,14 +3,16 @@
     stopped --start--> acquiring --stop--> stopped --close--> closed
 
 A frame is rendered when it is asked for and its exposure is over, from the world's timeline; nothing runs in the
-background, so virtual and real time give the same frames. Frames wait in `buffers` buffers; when all are full,
-further frames are lost, as they are where a stream runs out of buffers.
+background, so virtual and real time give the same frames. In mode HARDWARE the edges of the world's lines start
+exposures; an edge that finds the camera busy is counted and dropped (or latched). Frames wait in `buffers` buffers;
+when all are full, further frames are lost, as they are where a stream runs out of buffers.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -23,6 +25,7 @@ from drivers.simulated.camera_settings import (
     checked,
 )
 from drivers.simulated.faults import Allowance, chance
+from drivers.simulated.lines import LineName
 from drivers.simulated.options import Settings
 from drivers.simulated.sensor import deviates
 from drivers.simulated.world import NOMINAL_EXPOSURE_NS, World
@@ -37,7 +40,7 @@ from scanner.devices import (
     TriggerMode,
     Truth,
 )
-from scanner.errors import ConfigError, DeviceBusy, DeviceError, DeviceLost
+from scanner.errors import DeviceBusy, DeviceError, DeviceLost
 from scanner.geometry import Calibration
 
 STAMP_BOUND_NS = 1000
@@ -45,6 +48,7 @@ STAMP_BOUND_NS = 1000
 
 _RANDOM_USE = 2
 _FAULT_USE = 3
+_LINE_USE = 5
 _LENT = 3
 """Frame buffers: the one lent, the one being filled, and one to spare for a reader that is late"""
 
@@ -91,6 +95,10 @@ class SimulatedCamera:
     _idle_ns: int
     """when the next exposure may begin"""
     _free_start_ns: int
+    _line_ns: int
+    """the last edge of the line that was seen"""
+    _latched_ns: int
+    """until then a latched edge waits, and another one is dropped"""
 
     def __init__(self, world: World, settings: Settings, name: str) -> None:
         world.hold("camera", self, name)
@@ -104,6 +112,7 @@ class SimulatedCamera:
         self._allowance = Allowance(self._faults.times)
         self._trigger_latency_ns = 1e3 * self._options.trigger_latency_us * self._random.uniform(0.9, 1.1)
         self._free_phase = self._random.uniform()
+        self._line_latency_ns = 1e3 * self._options.line_latency_us * world.random(_LINE_USE).uniform(0.8, 1.2)
         exposure = NOMINAL_EXPOSURE_NS // EXPOSURE_STEP_NS * EXPOSURE_STEP_NS
         self._taken = Taken(exposure, 0.0, world.settings.optics.bits)
         self._mode: TriggerMode | None = None
@@ -125,7 +134,7 @@ class SimulatedCamera:
     def capabilities(self) -> CameraCapabilities:
         """What it can do with the settings last applied."""
         width, height = self._world.rig.calibration.camera.size
-        latency = 1e3 * self._options.trigger_latency_us
+        latency, line_latency = 1e3 * self._options.trigger_latency_us, 1e3 * self._options.line_latency_us
         return CameraCapabilities(
             width=width,
             height=height,
@@ -136,8 +145,9 @@ class SimulatedCamera:
             exposure_max_ns=EXPOSURE_MAX_NS,
             exposure_step_ns=EXPOSURE_STEP_NS,
             min_gap_ns=self._gap_ns,
-            trigger_modes=frozenset({TriggerMode.FREE, TriggerMode.SOFTWARE}),
+            trigger_modes=frozenset(TriggerMode),
             trigger_latency=Interval(round(0.75 * latency), round(1.25 * latency)),
+            line_latency=Interval(round(0.75 * line_latency), round(1.25 * line_latency)),
             stamp=Source.HARDWARE,
             stamp_bound_ns=STAMP_BOUND_NS,
             gain_max_db=GAIN_MAX_DB,
@@ -163,15 +173,12 @@ class SimulatedCamera:
         self._check_plugged()
         if self._mode is not None:
             raise DeviceBusy("the camera is acquiring already", device=self._name, hint="stop it first")
-        if mode not in self.capabilities.trigger_modes:
-            raise ConfigError(
-                f"no trigger mode {mode.value!r} on this camera", device=self._name, hint="free, software"
-            )
         self._forget_shots()
         self._mode = mode
         self._fill_ring()
         now = self._clock.now_ns()
         self._free_start_ns = now + int(self._free_phase * self._period_ns)
+        self._line_ns = now
 
     def trigger(self) -> None:
         """Start one exposure now, unless the camera is busy; see `scanner.devices.Camera.trigger`."""
@@ -199,6 +206,10 @@ class SimulatedCamera:
             if self._waiting:
                 return self._deliver(self._waiting.popleft())
             coming = self._coming(deadline)
+            edge = self._next_edge() if coming is None else None
+            if edge is not None and edge <= deadline:
+                self._clock.sleep_until(edge)
+                continue
             if coming is None or coming.ready_ns > deadline:
                 self._clock.sleep_until(deadline)
                 return None
@@ -284,6 +295,7 @@ class SimulatedCamera:
         """Move shots that are ready to the buffers; where those are full, frames are lost."""
         while True:
             self._begin_free(now_ns)
+            self._begin_line(now_ns)
             if not self._exposed or self._exposed[0].waits or self._exposed[0].ready_ns > now_ns:
                 return
             shot = self._exposed.popleft()
@@ -295,6 +307,23 @@ class SimulatedCamera:
             while self._free_start_ns + self._ordinal * self._period_ns <= now_ns:
                 self._expose(self._free_start_ns + self._ordinal * self._period_ns, None)
 
+    def _next_edge(self) -> int | None:
+        """HARDWARE: the next edge of the line, as things stand."""
+        line = self._world.lines.get(self._line) if self._mode is TriggerMode.HARDWARE else None
+        return None if line is None else line.next_edge(self._line_ns)
+
+    def _begin_line(self, now_ns: int) -> None:
+        """Take the edges up to now, each with the exposure it starts, if any."""
+        while (edge := self._next_edge()) is not None and edge <= now_ns:
+            self._line_ns = edge
+            self._triggers += 1
+            start = edge + round(self._line_latency_ns)
+            if start < self._idle_ns:
+                if not self._options.latch or start < self._latched_ns:
+                    continue
+                start = self._latched_ns = self._idle_ns
+            self._expose(start, self._triggers - 1 if self._options.counts_triggers else None)
+
     def _forget_shots(self) -> None:
         self._exposed = deque()
         self._waiting = deque()
@@ -305,6 +334,8 @@ class SimulatedCamera:
         self._triggers = 0
         self._idle_ns = 0
         self._free_start_ns = 0
+        self._line_ns = 0
+        self._latched_ns = 0
 
     # --- frames --------------------------------------------------------------------------------------------------
 
@@ -383,6 +414,10 @@ class SimulatedCamera:
         return frame
 
     # --- settings ------------------------------------------------------------------------------------------------
+
+    @property
+    def _line(self) -> LineName:
+        return cast("LineName", self._options.line)
 
     @property
     def _rolling(self) -> bool:

@@ -1,4 +1,4 @@
-"""What the registry opens: the simulated camera's and projector's drivers."""
+"""What the registry opens: the drivers of the simulated camera, projector and trigger board."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from drivers.simulated.options import DEFAULT_SCENE, read_settings
 from drivers.simulated.projector import SimulatedProjector
 from drivers.simulated.rigs import rig, rig_names
 from drivers.simulated.scenes import scene_names
+from drivers.simulated.trigger_board import CAPABILITIES, SimulatedTriggerBoard
 from drivers.simulated.world import enter_world
 from scanner.clock import Clock
 from scanner.devices import DeviceInfo
@@ -57,6 +58,24 @@ class SimulatedProjectorDriver:
     def discover(self) -> Sequence[DeviceInfo]:
         """One projector for each reference rig."""
         return [_info(name, "projector") for name in rig_names()]
+
+
+class SimulatedTriggerDriver:
+    """Entry point of the group `fringed.triggers`."""
+
+    def open(self, device: str, options: Mapping[str, Any], clock: Clock) -> SimulatedTriggerBoard:
+        """Open the trigger board of a simulated world; see `SimulatedCameraDriver.open`."""
+        settings = read_settings(device, options, "trigger")
+        name = _name(settings.world.rig, settings.world.scene, "trigger board")
+        return SimulatedTriggerBoard(enter_world(settings, clock, name), settings, name)
+
+    def discover(self) -> Sequence[DeviceInfo]:
+        """One board for each reference rig."""
+        details = {"steps": CAPABILITIES.max_steps, "scenes": list(scene_names())}
+        return [
+            DeviceInfo(DRIVER, f"{name}/{DEFAULT_SCENE}", "trigger", f"simulated rig {name}", details)
+            for name in rig_names()
+        ]
 
 
 def _name(rig_name: str, scene: str, role: str) -> str:

@@ -65,6 +65,22 @@ class ProjectorFaults:
     times: int = field(default=FOREVER, metadata={"low": 0})
 
 
+@dataclass(frozen=True)
+class TriggerFaults:
+    """Faults of the simulated trigger board. Slots are positions in the table that was programmed."""
+
+    drop_pulses: tuple[int, ...] = ()
+    """slots whose pulse is reported and never reaches the camera"""
+    spurious: tuple[int, ...] = ()
+    """slots in whose dark time a pulse comes that nobody asked for"""
+    lose_events: tuple[int, ...] = ()
+    """slots whose event is never reported"""
+    source_ends_after: int | None = field(default=None, metadata={"low": 0})
+    """the source gives so many edges in a run, then none"""
+    unplug_after: int | None = field(default=None, metadata={"low": 0})
+    """DeviceLost after so many pulses"""
+
+
 class Allowance:
     """How often a fault may still occur."""
 

@@ -1,10 +1,10 @@
 """Device strings and option tables of the simulated driver, read into typed settings.
 
 A device string is `RIG/SCENE[?key=value&...]`: "casey2011/board?seed=3". The scene alone stands on casey2011; the
-empty string is casey2011/bust. Keys of the string are known to both devices, so that both may be given the same
-string; a fault that both have (`times`, `double`, `unplug_after`) is for both unless `camera.` or `projector.`
-stands in front. An option table (the rig file's `options`) belongs to its own device; its faults may stand in a
-nested table `faults`.
+empty string is casey2011/bust. Keys of the string are known to all devices, so that all may be given the same
+string; a fault that several have (`times`, `double`, `unplug_after`) is for each of them unless `camera.`,
+`projector.` or `trigger.` stands in front. An option table (the rig file's `options`) belongs to its own device; its
+faults may stand in a nested table `faults`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 from urllib.parse import parse_qsl
 
-from drivers.simulated.faults import CameraFaults, ProjectorFaults, check_order
+from drivers.simulated.faults import CameraFaults, ProjectorFaults, TriggerFaults, check_order
 from drivers.simulated.optics import Optics
 from drivers.simulated.rigs import rig_names
 from drivers.simulated.scenes import SceneOptions, scene_names
@@ -26,13 +26,13 @@ from scanner.errors import ConfigError
 
 DEFAULT_SCENE = "bust"
 
-Side = Literal["camera", "projector"]
+Side = Literal["camera", "projector", "trigger"]
 _S = TypeVar("_S")
 
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """What camera and projector share beside the optics."""
+    """What the devices share beside the optics."""
 
     seed: int = field(default=0, metadata={"low": 0, "high": 2**31 - 1})
     """of noise, jitter, phases, and of the poses of printed targets"""
@@ -49,6 +49,12 @@ class CameraOptions:
     trigger_latency_us: float = field(default=40.0, metadata={"low": 1.0, "high": 1e5})
     """declared as this +- 25 %; the true one varies within"""
     counts_triggers: bool = True
+    line: str = field(default="trigger", metadata={"choices": ("trigger", "frame", "exposure")})
+    """what is wired to the camera's line: the trigger board, or an output of the projector"""
+    line_latency_us: float = field(default=8.0, metadata={"low": 0.0, "high": 1e5})
+    """edge on the line to the first row's start, declared as this +- 25 %; the true one varies within"""
+    latch: bool = False
+    """an edge that comes while the camera is busy starts an exposure when it is free again; one such edge is kept"""
     buffers: int = field(default=8, metadata={"low": 1, "high": 1024})
     """frames the camera keeps for a host that is slow; further ones are lost"""
     ring: int = field(default=0, metadata={"low": 0, "high": 4096})
@@ -73,13 +79,25 @@ class ProjectorOptions:
     """the declared interval is latency_us +- this; the true latency lies in it, with some jitter"""
     settle_us: float = field(default=200.0, metadata={"low": 0.0, "high": 1e6})
     """true time of a pixel's change, declared as 0.5 .. 1.5 of it (after the sweep, with scan=rows)"""
+    trigger_outputs: str = field(default="none", metadata={"choices": ("none", "frame", "exposure", "both")})
+    """frame: a pulse at every refresh, when its light begins; exposure: a pulse when a flip's new image lights up"""
     declare_latency: bool = True
     """false: latency and settle are None in the capabilities, as on an unmeasured rig"""
 
 
 @dataclass(frozen=True)
+class TriggerOptions:
+    """The simulated trigger board's make."""
+
+    clock_ppm: float = field(default=20.0, metadata={"low": -1e4, "high": 1e4})
+    """its crystal is slow by this: dark times and exposures are longer"""
+    stamp_bound_us: float = field(default=5.0, metadata={"low": 1.0, "high": 1e5})
+    """events are true to this"""
+
+
+@dataclass(frozen=True)
 class WorldSettings:
-    """Everything that makes a world; equal for both devices in it."""
+    """Everything that makes a world; equal for all devices in it."""
 
     rig: str
     scene: str
@@ -99,14 +117,17 @@ class Settings:
     """what the device string means; two devices with the same one share a world"""
     camera: CameraOptions
     projector: ProjectorOptions
+    trigger: TriggerOptions
     camera_faults: CameraFaults
     projector_faults: ProjectorFaults
+    trigger_faults: TriggerFaults
 
 
 _WORLD: tuple[type[Any], ...] = (WorldOptions, Optics, SceneOptions)
 _SIDES: Mapping[str, tuple[type[Any], ...]] = {
     "camera": (CameraOptions, CameraFaults),
     "projector": (ProjectorOptions, ProjectorFaults),
+    "trigger": (TriggerOptions, TriggerFaults),
 }
 
 
@@ -117,7 +138,7 @@ def read_settings(device: str, options: Mapping[str, Any], side: Side) -> Settin
         ConfigError: unknown rig, scene or key (with a suggestion and the list), or a value that does not fit.
     """
     rig, scene, query = _split(device)
-    given: dict[str, dict[str, Any]] = {"world": {}, "camera": {}, "projector": {}}
+    given: dict[str, dict[str, Any]] = {"world": {}, "camera": {}, "projector": {}, "trigger": {}}
     for key, value in query:
         _sort_query_key(key, value, given)
     key_of_world = (rig, scene, tuple(sorted(query)))
@@ -137,8 +158,10 @@ def read_settings(device: str, options: Mapping[str, Any], side: Side) -> Settin
         key=key_of_world,
         camera=_take(CameraOptions, given["camera"]),
         projector=_take(ProjectorOptions, given["projector"]),
+        trigger=_take(TriggerOptions, given["trigger"]),
         camera_faults=camera_faults,
         projector_faults=projector_faults,
+        trigger_faults=_take(TriggerFaults, given["trigger"]),
     )
 
 
@@ -194,7 +217,7 @@ def _sort_query_key(key: str, value: str, given: dict[str, dict[str, Any]]) -> N
         return
     found = [place for place in given if name in _keys(place)]
     if not found:
-        everything = tuple(sorted(set(_keys("world") + _keys("camera") + _keys("projector"))))
+        everything = tuple(sorted({known for place in given for known in _keys(place)}))
         raise ConfigError(f"unknown option {key!r} of the simulated devices", hint=_suggest(name, everything))
     for place in found:
         given[place][name] = value

@@ -7,11 +7,12 @@ interval and jitters a little; then the image settles, everywhere at once or row
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from drivers.simulated.faults import Allowance, displayed_index
+from drivers.simulated.lines import Recorded, Regular
 from drivers.simulated.options import Settings
 from drivers.simulated.timeline import LoadedImage, Manner
 from drivers.simulated.world import World
@@ -23,6 +24,13 @@ PERIODS_PER_REFRESH = 4
 
 STAMP_BOUND_NS = 1000
 """Flip stamps are true to this"""
+
+_OUTPUTS: dict[str, frozenset[Literal["frame", "exposure"]]] = {
+    "none": frozenset(),
+    "frame": frozenset({"frame"}),
+    "exposure": frozenset({"exposure"}),
+    "both": frozenset({"frame", "exposure"}),
+}
 
 _RANDOM_USE = 1
 
@@ -42,6 +50,14 @@ class SimulatedProjector:
         options = self._options
         self._first_vblank_ns = world.epoch_ns + int(self._random.integers(options.refresh_ns))
         self._latency_ns = 1e3 * (options.latency_us + self._random.uniform(-0.5, 0.5) * options.latency_spread_us)
+        self._vsync = Regular(self._first_vblank_ns, options.refresh_ns)
+        self._frame_output = Regular(self._first_vblank_ns + round(self._latency_ns), options.refresh_ns)
+        self._exposure_output = Recorded()
+        world.lines["vsync"] = self._vsync
+        if options.trigger_outputs in ("frame", "both"):
+            world.lines["frame"] = self._frame_output
+        if options.trigger_outputs in ("exposure", "both"):
+            world.lines["exposure"] = self._exposure_output
         self._images: list[LoadedImage] = []
         self._shown: list[int] = []
         self._delay = 0
@@ -107,6 +123,8 @@ class SimulatedProjector:
         if self._open:
             self._open = False
             self._world.timeline.show(self._clock.now_ns(), None)
+            self._vsync.end(self._clock.now_ns())
+            self._frame_output.end(self._clock.now_ns())
             self._world.release("projector")
 
     def _check_open(self) -> None:
@@ -132,7 +150,9 @@ class SimulatedProjector:
             late += self._faults.late_flips
         if late > ordinal:
             return
-        self._world.timeline.show(t_ns + self._latency(ordinal), self._images[self._shown[ordinal - late]])
+        light_ns = t_ns + self._latency(ordinal)
+        self._world.timeline.show(light_ns, self._images[self._shown[ordinal - late]])
+        self._exposure_output.add(light_ns)
 
     def _latency(self, ordinal: int) -> int:
         """True latency of one flip, ns."""
@@ -164,5 +184,6 @@ class SimulatedProjector:
             refresh_ns=options.refresh_ns,
             modulation_period_ns=None if constant else round(options.refresh_ns / PERIODS_PER_REFRESH),
             scan="rows" if rows else "global",
+            trigger_outputs=_OUTPUTS[options.trigger_outputs],
             **declared,
         )

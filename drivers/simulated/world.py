@@ -1,7 +1,7 @@
 """The simulated world: one scene, one rig, one clock, and what shines in it.
 
-A camera and a projector opened with the same device string and the same clock stand in the same world. The world
-lives as long as one of them does; it is found by a weak registry.
+A camera, a projector and a trigger board opened with the same device string and the same clock stand in the same
+world. The world lives as long as one of them does; it is found by a weak registry.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.simulated import timeline
+from drivers.simulated.lines import Line, LineName
 from drivers.simulated.optics import Light, Optics, Plane, look_up
 from drivers.simulated.options import Settings, WorldSettings, check_same_world
 from drivers.simulated.rigs import Rig, rig
@@ -60,7 +61,7 @@ def enter_world(settings: Settings, clock: Clock, device: str) -> World:
 
 
 class World:
-    """What camera and projector share. Holds its clock, so that a world's key stays its own."""
+    """What the devices share. Holds its clock, so that a world's key stays its own."""
 
     def __init__(self, settings: WorldSettings, clock: Clock) -> None:
         self.settings = settings
@@ -68,6 +69,8 @@ class World:
         self.epoch_ns = clock.now_ns()
         self.rig: Rig = rig(settings.rig)
         self.timeline = Timeline()
+        self.lines: dict[LineName, Line] = {}
+        """the wires between the devices, put there by whoever drives them"""
         self._large: deque[LoadedImage] = deque(maxlen=LARGE_LIGHTS)
         self._holders: dict[str, weakref.ref[Any]] = {}
         values = np.arange(256) / 255.0
@@ -84,7 +87,7 @@ class World:
         return np.random.default_rng([self.settings.shared.seed, use])
 
     def hold(self, role: str, device: Any, name: str) -> None:
-        """Take the role of the world's camera or projector.
+        """Take the role of the world's camera, projector or trigger board.
 
         Raises:
             DeviceBusy: another one is open.
