@@ -17,6 +17,7 @@ import numpy as np
 from scanner.capture import Capture, CaptureHeader
 from scanner.compare import compare
 from scanner.decode import Decoded, Decoder, Reason, decoder_for
+from scanner.decode.stages import Observer
 from scanner.devices import Pixels, Truth
 from scanner.errors import CalibrationError, DecodeError
 from scanner.filters import FilterSettings
@@ -64,15 +65,22 @@ class Reconstruction:
     added makes `finish` decode from the folder: retakes are rare, and sums cannot forget.
     """
 
-    def __init__(self, header: CaptureHeader, calibration: Calibration | None, options: DecodeOptions) -> None:
+    def __init__(
+        self,
+        header: CaptureHeader,
+        calibration: Calibration | None,
+        options: DecodeOptions,
+        observer: Observer | None = None,
+    ) -> None:
         """Raise DecodeError or CalibrationError at once where these frames cannot become a scan."""
         if calibration is not None:
             _require_sizes(header, calibration)
         self._header = header
         self._calibration = calibration
         self._options = options
+        self._observer = observer
         self._timings: dict[str, float] = {}
-        self._decoder = self._new_decoder()
+        self._decoder = self._new_decoder(self._observer)
         self._slots: dict[int, int | None] = {}
 
     def add(self, pattern: int, frame: Pixels, slot: int | None = None) -> None:
@@ -129,8 +137,8 @@ class Reconstruction:
             if pattern not in self._slots:
                 self.add(pattern, capture.frame(pattern), slot)
 
-    def _new_decoder(self) -> Decoder:
-        return decoder_for(self._header.sequence, self._header.camera, self._options.decoder)
+    def _new_decoder(self, observer: Observer | None = None) -> Decoder:
+        return decoder_for(self._header.sequence, self._header.camera, self._options.decoder, observer)
 
     def _capture_report(self, capture: Capture) -> dict[str, Any]:
         header = capture.header
@@ -164,15 +172,16 @@ def reconstruct(
     calibration: Calibration | None,
     options: DecodeOptions | None = None,
     progress: Progress | None = None,
+    observer: Observer | None = None,
 ) -> Scan:
-    """Decode a folder, all at once.
+    """Decode a folder, all at once. `observer` is told the first repetition's intermediate images.
 
     Raises:
         SyncError, DecodeError, CalibrationError: see `Reconstruction.finish`.
     """
     tell = progress or (lambda _: None)
     tell("reading frames")
-    reconstruction = Reconstruction(capture.header, calibration, options or DecodeOptions())
+    reconstruction = Reconstruction(capture.header, calibration, options or DecodeOptions(), observer)
     for pattern, record in capture.records.items():
         reconstruction.add(pattern, capture.frame(pattern), record.slot)
     return reconstruction.finish(capture, progress)

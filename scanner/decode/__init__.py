@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.decode.stages import Observer
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, PmpPattern
 
@@ -82,17 +83,23 @@ class Decoder(Protocol):
 DECODERS: Mapping[str, tuple[str, ...]] = {"mcp": ("default", "casey2011")}
 """Decoders by name, of methods that have more than the default one."""
 
+WITH_STAGES = ("casey2011",)
+"""Decoders that tell an observer their intermediate images."""
 
-def decoder_for(sequence: PatternSequence, camera: CameraFormat, name: str = "default") -> Decoder:
+
+def decoder_for(
+    sequence: PatternSequence, camera: CameraFormat, name: str = "default", observer: Observer | None = None
+) -> Decoder:
     """The decoder for a pattern.
 
     Args:
         sequence: what was projected.
         camera: the frames' format.
         name: "default", or a decoder of that method by name: "casey2011" for MCP, the dissertation's own.
+        observer: told the intermediate images, if one is given.
 
     Raises:
-        DecodeError: no such decoder for this method.
+        DecodeError: no such decoder for this method, or one that has no stages for the observer.
     """
     # Imported on demand: a program that decodes PMP does not pay for MCP's kernels.
     method = sequence.pattern.method
@@ -102,10 +109,15 @@ def decoder_for(sequence: PatternSequence, camera: CameraFormat, name: str = "de
             f"no decoder {name!r} for method {method!r}",
             hint=f"leave --decoder out for the default; there are: default (any method), {others}",
         )
+    if observer is not None and name not in WITH_STAGES:
+        raise DecodeError(
+            f"decoder {name!r} has no stages to show",
+            hint=f"decoders that have: {', '.join(f'--decoder {known}' for known in WITH_STAGES)} (method mcp)",
+        )
     if name == "casey2011":
         from scanner.decode.mcp.casey2011 import CaseyDecoder  # noqa: PLC0415
 
-        return CaseyDecoder(sequence, camera)
+        return CaseyDecoder(sequence, camera, observer)
     if isinstance(sequence.pattern, PmpPattern):
         from scanner.decode.pmp import PmpDecoder  # noqa: PLC0415
 

@@ -17,6 +17,7 @@ from service.commands.options import (
     MinConfidence,
     OutputFolder,
     filter_members,
+    output_path,
 )
 from service.commands.summary import report_result
 from service.terminal import print_error, progress_lines
@@ -29,6 +30,12 @@ def decode(
     ] = None,
     output: OutputFolder = None,
     decoder: Annotated[str, typer.Option(metavar="NAME", help="Decoder, by name.")] = "default",
+    stages: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", parser=output_path, help="Folder for pictures of the decoder's stages, 01-input.png and on."
+        ),
+    ] = None,
     depth: Depth = None,
     box: Box = None,
     min_confidence: MinConfidence = None,
@@ -48,6 +55,7 @@ def decode(
       fringed decode scan/capture -o again --no-edge-filter
       fringed decode skull/capture-gray.json --calibration skull/calibration.json
       fringed decode old/capture --depth 380:430 --force
+      fringed decode scan/capture -o again --decoder casey2011 --stages pictures
     """
     filters = filter_members(depth, box, min_confidence, edge_filter=edge_filter)
     began = time.monotonic()
@@ -55,22 +63,30 @@ def decode(
         lines.stage("opening the capture")
         from scanner.capture import Capture  # noqa: PLC0415  (array libraries and kernels)
         from scanner.reconstruct import DecodeOptions, calibration_for, reconstruct  # noqa: PLC0415
+        from scanner.stage_pictures import StageFolder  # noqa: PLC0415
         from scanner.storage import prepare_output  # noqa: PLC0415
 
         options = DecodeOptions.from_dict({"decoder": decoder, "filters": filters, "compare_truth": compare_truth})
         opened = Capture.open(capture)
         lens_file = calibration_for(opened, calibration)
         folder = output or opened.path / "scan"
-        existed = folder.exists()
+        new = [f for f in (folder, stages) if f is not None and not f.exists()]
         prepare_output(folder, force=force)
+        observer = None if stages is None else StageFolder(prepare_output(stages, force=force))
         try:
-            made = reconstruct(opened, lens_file, options, lines.stage)
+            made = reconstruct(opened, lens_file, options, lines.stage, observer)
             lines.stage("writing files")
             made.save(folder)
         except BaseException:
-            if not existed and not any(folder.iterdir()):
-                folder.rmdir()
+            # The stages up to a failure stay: they are what it is looked for with.
+            if observer is not None and observer.written:
+                lines.note(f"stages up to the failure: {stages}")
+            for made_here in reversed(new):
+                if made_here.exists() and not any(made_here.iterdir()):
+                    made_here.rmdir()
             raise
+        if observer is not None:
+            lines.note(f"{len(observer.written)} stages: {stages}")
     if made.xyz is None:
         print_error("no calibration: values are decoded, but no points", "--calibration FILE", label="warning")
     report_result(folder, time.monotonic() - began, lines.spent, as_json=as_json)

@@ -355,7 +355,8 @@ def board():
 
 def test_the_board_comes_out_with_the_depth_error_of_whole_pixels(board):
     frame, sequence, camera, truth, calibration = board
-    decoder = decoder_for(sequence, camera, "casey2011")
+    stages = {}
+    decoder = decoder_for(sequence, camera, "casey2011", lambda stage: stages.update({stage.name: stage.values}))
     assert isinstance(decoder, CaseyDecoder)
     decoder.add(0, frame)
     decoded = decoder.finish()
@@ -384,7 +385,7 @@ def test_the_board_comes_out_with_the_depth_error_of_whole_pixels(board):
     true = np.where(stripe % 2 == 0, stripe // 2, 0)
     shares = []
     for name in ("code", "hmm", "grown"):
-        seen = decoder.stages[name]
+        seen = stages[name]
         shares.append((seen == true)[(seen > 0) & truth.lit].mean())
     assert shares[0] > 0.75
     assert shares[0] < shares[1] <= shares[2]
@@ -405,6 +406,32 @@ def test_vertical_stripes_come_out_as_horizontal_ones_do(board):
     np.testing.assert_array_equal(turned.peaks[:, :2], upright.peaks[:, 1::-1])
 
 
+def test_an_image_upside_down_comes_out_as_the_upright_one_does(board):
+    frame, sequence, camera, _truth, _calibration = board
+    upright = decode_image(frame, PUBLISHED, sequence.projector, camera)
+    turned = decode_image(np.ascontiguousarray(frame[::-1, ::-1]), PUBLISHED, sequence.projector, camera)
+    assert turned.details["upside_down"]
+    assert "upside_down" not in upright.details
+    back = turned.stripes[::-1, ::-1]
+    both = (back >= 0) & (upright.stripes >= 0)
+    assert both.sum() > 0.9 * (upright.stripes >= 0).sum()
+    assert (back == upright.stripes)[both].all()
+    x, y, row, *_ = turned.peaks.T
+    np.testing.assert_array_equal(turned.rows[y.astype(int), x.astype(int)], row)
+
+
+def test_a_pattern_turned_by_90_degrees_is_named(board):
+    frame, sequence, camera, _truth, _calibration = board
+    other_way = CameraFormat(camera.height, camera.width, camera.bits)
+    for turned in (frame.T, frame.T[:, ::-1]):
+        with pytest.raises(DecodeError, match="turned by 90 degrees"):
+            decode_image(np.ascontiguousarray(turned), PUBLISHED, sequence.projector, other_way)
+    described = replace(PUBLISHED, axis="x")
+    with pytest.raises(DecodeError, match="turned by 90 degrees") as refused:
+        decode_image(frame, described, ProjectorSize(864, 1152), camera)
+    assert "axis" in refused.value.hint
+
+
 def test_what_is_not_the_pattern_described_is_refused(board):
     frame, sequence, camera, _truth, _calibration = board
     noise = np.random.default_rng(0).integers(0, 255, frame.shape).astype(np.uint8)
@@ -412,7 +439,7 @@ def test_what_is_not_the_pattern_described_is_refused(board):
         "uniform": (np.zeros_like(frame), PUBLISHED),
         "no carriers stand out": (noise, PUBLISHED),
         "no carriers": (frame, McpPattern()),
-        "contradict": (frame, replace(PUBLISHED, codes=PUBLISHED.codes[::-1])),
+        "contradict": (frame, replace(PUBLISHED, codes=McpPattern().codes)),
     }
     for message, (image, pattern) in cases.items():
         with pytest.raises(DecodeError, match=message):

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Reason
 from scanner.decode.mcp.casey2011 import carrier_search, channels, growth, hidden_markov, inclination, stripe_detection
+from scanner.decode.mcp.casey2011.shown import Shown
 from scanner.decode.mcp.decoder import McpDecoder, turned_back, upright_image
 from scanner.decode.mcp.locate import Stages
 from scanner.decode.mcp.model import PatternModel
+from scanner.decode.stages import Observer
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
 
@@ -37,24 +39,25 @@ BAND_CONTRAST = 4.0
 """Least ratio of the weakest carrier's band to what lies between bands: noise and other patterns stay below 2, the
 reference scenes lie above 15."""
 
-AGREEMENT = 0.25
-"""Least share of code words on the peaks that the model's path keeps. A wrong order of codes keeps up to .16 of them,
-the reference scenes .41 and more."""
+AGREEMENT = 0.55
+"""Least share of the filtered code words on the peaks that the model's path keeps. The reference scenes keep .70 and
+more; wrong orders of codes keep up to .35 where the whole pattern is seen, and .53 where a small object shows five
+code words only."""
 
 
 class CaseyDecoder(McpDecoder):
     """Takes the one frame of an MCP sequence and decodes it as published.
 
-    `stages` holds the named intermediate images after `finish`, stripes horizontal, like figures 5.4-5.14.
+    `observer` is told the intermediate images, stripes horizontal, like figures 5.4-5.15 (`shown.STAGES`).
     """
 
-    def __init__(self, sequence: PatternSequence, camera: CameraFormat) -> None:
+    def __init__(self, sequence: PatternSequence, camera: CameraFormat, observer: Observer | None = None) -> None:
         super().__init__(sequence, camera)
-        self.stages: dict[str, NDArray[Any]] = {}
+        self._observer = observer
 
     def finish(self) -> Decoded:
         """The maps; see `scanner.decode.Decoder`."""
-        return decode_image(self.frame(), self._pattern, self._sequence.projector, self._camera, self.stages)
+        return decode_image(self.frame(), self._pattern, self._sequence.projector, self._camera, self._observer)
 
 
 def decode_image(
@@ -62,7 +65,7 @@ def decode_image(
     pattern: McpPattern,
     projector: ProjectorSize,
     camera: CameraFormat,
-    stages: dict[str, NDArray[Any]] | None = None,
+    observer: Observer | None = None,
 ) -> Decoded:
     """Decode one image as published.
 
@@ -71,39 +74,53 @@ def decode_image(
         pattern: what was projected.
         projector: size of the projector's image.
         camera: format of `image`.
-        stages: takes the intermediate images by name: input, enhanced, regions, stripes, slope; spectrum, bands
-            (A, B, C of fig. 4.9), channel_i and bits_i of each segment ("spectrum_negligible"); on the peaks, 0
-            elsewhere: code, code_modal, hmm, hmm_modal, blobs, grown (code words), all_stripes (index + 1), all_2x_4x
-            (4 index + 1); growth_mask.
+        observer: told the intermediate images in order, up to the stage that fails if one does; see `shown.STAGES`.
 
     Returns:
         maps on the camera's grid, with rows on the pixels of stripe peaks, minima and mid-levels only.
 
     Raises:
-        DecodeError: no stripes, other carriers than described, or codes that contradict the description.
+        DecodeError: no stripes, other carriers than described, codes that contradict the description, or a pattern
+            turned by 90 degrees.
     """
     pattern.validate(projector)
     upright = upright_image(image, pattern, camera)
-    seen: dict[str, NDArray[Any]] = stages if stages is not None else {}
     model = PatternModel.of(pattern, projector)
+    try:
+        decoded = _decode(upright, pattern, model, camera, Shown(observer))
+    except DecodeError:
+        found = _upside_down(upright, pattern, model, camera, observer)
+        if found is None:
+            _refuse_turned(upright, pattern, model, camera)
+            raise
+        decoded = found
+    return decoded if pattern.axis == "y" else turned_back(decoded)
+
+
+def _decode(
+    image: NDArray[Any], pattern: McpPattern, model: PatternModel, camera: CameraFormat, show: Shown
+) -> Decoded:
+    """The stages in order, stripes horizontal and the first on top."""
+    upright = image
     clock = Stages()
+    show("input", upright)
     _refuse_flat(upright, camera)
     with clock.stage("stripes"):
         found = stripe_detection.detect(upright, model.stripes, model.weakest)
-        _refuse_few(found, upright)
-        seen["input"], seen["enhanced"], seen["regions"] = upright, found.enhanced, found.region
-        seen["stripes"] = found.peaks.image(found.region.shape)
-    read = _read_channels(upright, found, model, clock, seen)
-    named = _name_peaks(read.word, found, pattern, model, clock, seen)
+    show("enhanced", found.enhanced)
+    show("regions", found.region)
+    show.on_peaks("stripes", np.ones(len(found.peaks.y), np.uint8), found)
+    _refuse_few(found, upright)
+    read = _read_channels(upright, found, model, clock, show)
+    named = _name_peaks(read.word, found, pattern, model, clock, show)
     with clock.stage("stripes between"):
         light = found.calm[found.peaks.y, found.peaks.column]
         stripe, sure = growth.name_unmodulated(named.stripe, named.sure, found.peaks, light)
-        seen["all_stripes"] = _image(stripe + 1, found)
         marks = growth.name_2x_4x(found.calm, stripe, sure, found.peaks)
     with clock.stage("maps"):
         decoded = _maps(upright, found, stripe, marks, model, camera)
-    seen["all_2x_4x"] = np.zeros(upright.shape, np.int32)
-    seen["all_2x_4x"][marks.y, marks.x] = np.rint(4 * marks.index).astype(np.int32) + 1
+    show.on_peaks("all-stripes", stripe + 1, found)
+    show.marks(marks, model.pitch, found.region.shape)
     details = {
         **named.figures,
         "pitch_px": round(found.wavelength, 3),
@@ -117,8 +134,42 @@ def decode_image(
         "timings_ms": {name: round(ms, 2) for name, ms in clock.ms.items()},
     }
     warnings = () if len(marks.x) else ("stripes and carriers are there, but no stripe could be decided",)
-    decoded = replace(decoded, details=details, warnings=warnings)
-    return decoded if pattern.axis == "y" else turned_back(decoded)
+    return replace(decoded, details=details, warnings=warnings)
+
+
+# --- another way up -----------------------------------------------------------------------------------------------
+
+
+def _upside_down(
+    image: NDArray[Any], pattern: McpPattern, model: PatternModel, camera: CameraFormat, observer: Observer | None
+) -> Decoded | None:
+    """The maps if the projector or the camera hangs upside down, so that the stripes' order is reversed; else None."""
+    try:
+        decoded = _decode(
+            np.ascontiguousarray(image[::-1]), pattern, model, camera, Shown(observer, "image upside down")
+        )
+    except DecodeError:
+        return None
+    names = ("rows", "sigma_rows", "confidence", "albedo", "modulation", "reason", "stripes")
+    flipped: dict[str, Any] = {name: np.ascontiguousarray(getattr(decoded, name)[::-1]) for name in names}
+    peaks = decoded.peaks
+    assert peaks is not None  # noqa: S101  (of this decoder they always are)
+    peaks[:, 1] = len(image) - 1 - peaks[:, 1]
+    return replace(decoded, **flipped, peaks=peaks, details={**decoded.details, "upside_down": True})
+
+
+def _refuse_turned(image: NDArray[Any], pattern: McpPattern, model: PatternModel, camera: CameraFormat) -> None:
+    """Raise DecodeError if the pattern is there, codes and all, once the image is turned."""
+    turned = np.ascontiguousarray(image.T)
+    for way_up in (turned, np.ascontiguousarray(turned[::-1])):
+        try:
+            _decode(way_up, pattern, model, camera, Shown(None))
+        except DecodeError:
+            continue
+        raise DecodeError(
+            "the pattern is turned by 90 degrees: its stripes run the other way",
+            hint='the other "axis" in the description, or turn projector or camera',
+        )
 
 
 # --- no pattern ---------------------------------------------------------------------------------------------------
@@ -183,7 +234,7 @@ def _read_channels(
     found: stripe_detection.Stripes,
     model: PatternModel,
     clock: Stages,
-    seen: dict[str, NDArray[Any]],
+    show: Shown,
 ) -> _Read:
     """Segments, their carriers and channels; code words on the peaks (sec. 4.2-4.5)."""
     peaks, shape, width = found.peaks, found.region.shape, image.shape[1]
@@ -191,9 +242,11 @@ def _read_channels(
     expected = model.carriers[ascending].astype(np.float64) * model.pitch / found.wavelength
     with clock.stage("inclination"):
         slope = inclination.slopes(peaks, found.wavelength)
+        show.on_peaks("slope", slope, found, elsewhere=np.nan)
         limit = inclination.negligible_slope(found.wavelength, float(np.diff(expected).min()))
         parts = inclination.segments(peaks, slope, limit, found.wavelength, shape)
         number = inclination.segment_of(parts, slope, limit)
+    several = len(parts) > 1
     word = np.zeros(len(peaks.y), np.int32)
     searches: list[carrier_search.Search] = []
     used: list[inclination.Segment] = []
@@ -208,6 +261,11 @@ def _read_channels(
             search = carrier_search.search(folded, expected, width)
             if k == 0 and not _match(search, expected):
                 search = carrier_search.search(folded, expected, width, near=True)
+        title = part.name if several else ""
+        show("spectrum", folded, title)
+        show("bands", np.stack([search.A, search.B, search.C]), title)
+        with clock.stage("carriers"):
+            if k == 0:
                 _refuse_carriers(search, expected, width)
             alike = k == 0 or np.allclose(search.frequency, searches[0].frequency, rtol=MATCH)
             if not (alike and _match(search, expected)):
@@ -223,13 +281,11 @@ def _read_channels(
                 isolated = channels.isolate(transform, frequency, sigma, found.wavelength, shape)
                 binary = channels.binarize(isolated, frequency, mask)
                 bits[channel] = inclination.turned_back(binary, part)
-                seen[f"channel_{channel}_{part.name}"] = isolated
-                seen[f"bits_{channel}_{part.name}"] = bits[channel]
+                show("channel", isolated, title, f"{channel}")
+                show("bits", bits[channel], title, f"{channel}")
             # The first segment reads all peaks; those of a segment of its own are then read again.
             mine = number == k if k > 0 else np.ones(len(word), bool)
             word[mine] = channels.code_words(bits, peaks.y[mine], peaks.column[mine])
-        seen[f"spectrum_{part.name}"], seen[f"bands_{part.name}"] = folded, np.stack([search.A, search.B, search.C])
-    seen["slope"] = _image(slope, found)
     return _Read(word, used, searches)
 
 
@@ -248,13 +304,19 @@ def _name_peaks(
     pattern: McpPattern,
     model: PatternModel,
     clock: Stages,
-    seen: dict[str, NDArray[Any]],
+    show: Shown,
 ) -> _Named:
     """Hidden Markov model and what follows it, on modulated stripes (sec. 4.5, 5.2-5.4)."""
     peaks, wavelength, shape = found.peaks, found.wavelength, found.region.shape
     stripes = np.array([s for s in range(model.stripes) if pattern.code_of(s)], np.int32)
     symbols = np.array([pattern.code_of(int(s)) for s in stripes], np.int32)
     lit = int((model.level > 0).sum())
+    show.on_peaks("code", word, found)
+    with clock.stage("modal filter"):
+        # "Modal filtering could often improve results of further processing steps" (sec. 5.5): the model is given the
+        # filtered code words, as for tables 5.1 and 5.2.
+        word = growth.modal_filter(word, peaks, wavelength)
+        show.on_peaks("code-modal", word, found)
     with clock.stage("hidden Markov model"):
         expected = (model.ratio > 0).sum(axis=0) / lit
         miss = channels.miss_rates(word, expected)
@@ -263,6 +325,7 @@ def _name_peaks(
         path = hidden_markov.best_paths(word, peaks.start, known)
         sure = hidden_markov.posteriors(word, peaks.start, path, known)
     as_word = np.concatenate(([0], symbols)).astype(np.int32)
+    show.on_peaks("hmm", as_word[path], found)
     agreement = float((word[word > 0] == as_word[path[word > 0]]).mean()) if (word > 0).any() else 0.0
     if agreement < AGREEMENT:
         raise DecodeError(
@@ -271,17 +334,16 @@ def _name_peaks(
         )
     with clock.stage("modal filter"):
         modal = growth.modal_filter(path, peaks, wavelength)
-        seen["code_modal"] = _image(growth.modal_filter(word, peaks, wavelength), found)
+    show.on_peaks("hmm-modal", as_word[modal], found)
     with clock.stage("blobs"):
         period = wavelength / (model.pitch * float(model.carriers.min()))
         beat = wavelength / (model.pitch * model.separation)
         solid = growth.eliminate_blobs(modal, peaks, shape, wavelength, round(period), round(beat / 2))
+    show.on_peaks("blobs", as_word[solid], found)
     with clock.stage("growth"):
         grown, mask = growth.grow(solid, peaks, found.region, wavelength)
-    seen["code"] = _image(word, found)
-    for name, label in (("hmm", path), ("hmm_modal", modal), ("blobs", solid), ("grown", grown)):
-        seen[name] = _image(as_word[label], found)
-    seen["growth_mask"] = mask
+    show("growth-mask", mask)
+    show.on_peaks("grown", as_word[grown], found)
     own = (grown == path) & (path > 0)
     usual = float(sure[own].mean()) if own.any() else 0.0
     sure = np.where(own, sure, np.where(grown > 0, usual, 0)).astype(np.float32)
@@ -336,10 +398,3 @@ def _maps(
         stripes=named,
         peaks=listed,
     )
-
-
-def _image(value: NDArray[Any], found: stripe_detection.Stripes) -> NDArray[Any]:
-    """Values of the peaks as an image, zero elsewhere."""
-    image = np.zeros(found.region.shape, value.dtype)
-    image[found.peaks.y, found.peaks.column] = value
-    return image
