@@ -18,6 +18,7 @@ from scanner.capture import Capture, CaptureHeader
 from scanner.compare import compare
 from scanner.decode import Decoded, Decoder, Reason, decoder_for
 from scanner.decode.stages import Observer
+from scanner.decode.repeated import Repetitions
 from scanner.devices import Pixels, Truth
 from scanner.errors import CalibrationError, DecodeError
 from scanner.filters import FilterSettings
@@ -61,8 +62,9 @@ class DecodeOptions:
 class Reconstruction:
     """The decoding of one capture, fed frame by frame.
 
-    `add` each frame as it arrives, then `finish` with the closed folder. A frame that was taken again after it was
-    added makes `finish` decode from the folder: retakes are rare, and sums cannot forget.
+    `add` each frame as it arrives, then `finish` with the closed folder. Repetitions of the sequence are decoded one
+    after the other, each as soon as it is whole, and averaged. A frame that was taken again after it was added makes
+    `finish` decode from the folder: retakes are rare, and sums cannot forget.
     """
 
     def __init__(
@@ -80,23 +82,35 @@ class Reconstruction:
         self._options = options
         self._observer = observer
         self._timings: dict[str, float] = {}
-        self._decoder = self._new_decoder(self._observer)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._decoders: dict[int, Decoder] = {0: self._new_decoder(self._observer)}
+        self._repetitions = Repetitions(self._header.repeat, ambiguity_px(self._header.sequence))
+        self._failed: dict[int, DecodeError] = {}
         self._slots: dict[int, int | None] = {}
 
     def add(self, pattern: int, frame: Pixels, slot: int | None = None) -> None:
         """Take one frame.
 
         Args:
-            pattern: repetition x patterns + position; only the first repetition is decoded.
+            pattern: repetition x patterns + position.
             frame: (H, W) uint8 or uint16; not kept.
             slot: its slot in the folder.
+
+        Raises:
+            DecodeError: see `scanner.decode.Decoder.add`.
         """
-        if pattern >= len(self._header.sequence):
+        if pattern in self._slots or not 0 <= pattern < self._header.frame_count:
             return
-        if pattern not in self._slots:
-            with self._timed("decode frames"):
-                self._decoder.add(pattern, frame)
-            self._slots[pattern] = slot
+        repetition, position = divmod(pattern, len(self._header.sequence))
+        with self._timed("decode frames"):
+            if repetition not in self._decoders:
+                self._decoders[repetition] = self._new_decoder()
+            self._decoders[repetition].add(position, frame)
+        self._slots[pattern] = slot
+        if self._header.repeat > 1 and self._is_whole(repetition):
+            self._end_repetition(repetition)
 
     def finish(self, capture: Capture, progress: Progress | None = None) -> Scan:
         """The scan, once the folder is closed (or interrupted).
@@ -113,8 +127,7 @@ class Reconstruction:
             check.raise_if_out_of_step()
         self._catch_up(capture)
         tell("decoding")
-        with self._timed("decode"):
-            decoded = self._decoder.finish()
+        decoded = self._decoded()
         if len(self._header.sequence) > 1:
             # The witnesses have seen light: without it the check ends in an error of its own.
             raise_if_empty(decoded)
@@ -126,13 +139,36 @@ class Reconstruction:
             scan = self._compared(scan, capture)
         return scan
 
-    def _catch_up(self, capture: Capture) -> None:
+    def _is_whole(self, repetition: int) -> bool:
         count = len(self._header.sequence)
-        present = {pattern: record.slot for pattern, record in capture.records.items() if pattern < count}
+        return all(pattern in self._slots for pattern in range(repetition * count, (repetition + 1) * count))
+
+    def _end_repetition(self, repetition: int) -> None:
+        decoder = self._decoders.pop(repetition)
+        try:
+            with self._timed("decode"):
+                self._repetitions.add(decoder.finish())
+        except DecodeError as error:
+            self._failed[repetition] = error
+
+    def _decoded(self) -> Decoded:
+        """The mean of all repetitions; one that cannot be decoded is left out and named, unless none can."""
+        for repetition in sorted(self._decoders):
+            self._end_repetition(repetition)
+        if self._repetitions.count == 0:
+            raise self._failed[min(self._failed)]
+        with self._timed("decode"):
+            decoded = self._repetitions.result()
+        absent = self._header.repeat - self._repetitions.count - len(self._failed)
+        said = [f"repetition {n + 1} was left out: {error}" for n, error in sorted(self._failed.items())]
+        said += [f"{absent} of {self._header.repeat} repetitions have no frames"] if absent else []
+        return replace(decoded, warnings=(*decoded.warnings, *said)) if said else decoded
+
+    def _catch_up(self, capture: Capture) -> None:
+        present = {pattern: record.slot for pattern, record in capture.records.items()}
         stale = any(slot is not None and present.get(pattern) != slot for pattern, slot in self._slots.items())
         if stale or self._slots.keys() - present.keys():
-            self._decoder = self._new_decoder()
-            self._slots = {}
+            self._begin()
         for pattern, slot in present.items():
             if pattern not in self._slots:
                 self.add(pattern, capture.frame(pattern), slot)

@@ -70,9 +70,9 @@ def solve(design: NDArray[np.float64], frames: Array) -> Array:
 
 
 def clipped_pixels(scene: Scene) -> NDArray[np.bool_]:
-    """(P,) samples that saturate in any fringe frame."""
-    top = np.max([scene.frames[p] for p in scene.sequence.fringes if p in scene.frames], axis=0)
-    return np.asarray(top >= scene.max_value)
+    """(P,) samples that saturate in any fringe frame that is there."""
+    fringes = [scene.frames[p] for p in scene.sequence.fringes if p in scene.frames]
+    return np.any([frame >= scene.max_value for frame in fringes], axis=0) if fringes else np.zeros_like(scene.lit)
 
 
 def bright_pixels(scene: Scene, fit: Fit, clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:

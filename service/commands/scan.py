@@ -52,7 +52,7 @@ def scan(
         str | None,
         typer.Option(metavar="RIG", help="A rig file, or simulated[:SCENE], as simulated:bench2026/sphere_board."),
     ] = None,
-    method: Annotated[Method, typer.Option(metavar="pmp|mcp|gray", help="What to project.")] = Method.PMP,
+    method: Annotated[Method, typer.Option(metavar="pmp|mcp|gray|cp", help="What to project.")] = Method.PMP,
     output: OutputFolder = None,
     connect: Connect = None,
     exposure: Annotated[
@@ -65,7 +65,7 @@ def scan(
     carriers: Carriers = None,
     profile: Profile = None,
     levels: Levels = None,
-    repeat: Annotated[int, typer.Option(metavar="N", min=1, max=1000, help="Repetitions of the whole sequence.")] = 1,
+    repeat: Annotated[int, typer.Option(metavar="N", min=1, max=1000, help="Repetitions of the whole sequence, averaged.")] = 1,
     depth: Depth = None,
     box: Box = None,
     min_confidence: MinConfidence = None,
