@@ -87,7 +87,7 @@ class Worker:
         thread.start()
         try:
             self._ready()
-            self._talk()
+            self._talk(thread)
         finally:
             self._work.cancel(None)
             self._jobs.put(None)
@@ -98,7 +98,8 @@ class Worker:
             os.close(self._woken)
             os.close(self._wake)
 
-    def _talk(self) -> None:
+    def _talk(self, decoder: threading.Thread) -> None:
+        """Until told to stop; ScannerError if the decoder's thread ends before: its series must go elsewhere."""
         poller = zmq.Poller()
         poller.register(self._socket, zmq.POLLIN)
         poller.register(self._woken, zmq.POLLIN)
@@ -106,6 +107,8 @@ class Worker:
             poller.register(self._lifeline, zmq.POLLIN)
         while True:
             events = dict(poller.poll(round(HEARTBEAT_S * 500)))
+            if not decoder.is_alive():
+                raise ScannerError("the decoding thread died", hint="its error stands above, in this log")
             if self._lifeline is not None and self._lifeline in events and not os.read(self._lifeline, 1):
                 return
             if self._woken in events:
