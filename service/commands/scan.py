@@ -65,7 +65,9 @@ def scan(
     carriers: Carriers = None,
     profile: Profile = None,
     levels: Levels = None,
-    repeat: Annotated[int, typer.Option(metavar="N", min=1, max=1000, help="Repetitions of the whole sequence, averaged.")] = 1,
+    repeat: Annotated[
+        int, typer.Option(metavar="N", min=1, max=1000, help="Repetitions of the whole sequence, averaged.")
+    ] = 1,
     depth: Depth = None,
     box: Box = None,
     min_confidence: MinConfidence = None,
