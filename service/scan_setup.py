@@ -18,6 +18,7 @@ from scanner.errors import ConfigError, DecodeError
 from scanner.geometry import Calibration, load_calibration
 from scanner.patterns import (
     Axis,
+    CompositePattern,
     GrayPattern,
     McpPattern,
     Pattern,
@@ -30,7 +31,7 @@ from scanner.patterns.sequence import Precorrection
 from scanner.sequencer import Rig, measure_latency
 from scanner.wire import ScanStart
 
-METHODS = ("pmp", "mcp", "gray")
+METHODS = ("pmp", "mcp", "gray", "cp")
 
 PMP_FINEST = 64
 """Cycles of the finest default fringe."""
@@ -210,6 +211,8 @@ def default_pattern(method: str, axes: tuple[Axis, ...], axis: Axis, projector: 
     if method == "gray":
         bits = max(math.ceil(math.log2(projector.along(a))) for a in axes)
         return GrayPattern(axes=axes, bits=bits, code_bits=bits)
+    if method == "cp":
+        return _composite(axis, projector)
     pattern = McpPattern(axis=axis)
     try:
         pattern.validate(projector)
@@ -223,6 +226,22 @@ def _pmp_frequencies(axes: tuple[Axis, ...], projector: ProjectorSize) -> tuple[
     finest = min(PMP_FINEST, max(4, least // PMP_LEAST_PERIOD_PX))
     # Equal ratios: each step of the unwrapping then has the same margin.
     return (1.0, float(round(math.sqrt(finest))), float(finest))
+
+
+def _composite(axis: Axis, projector: ProjectorSize) -> CompositePattern:
+    """The published carriers, in proportion to a smaller projector."""
+    pattern = CompositePattern(axis=axis)
+    across = projector.along("x" if axis == "y" else "y")
+    scale = min(1.0, across / 4 / max(pattern.carriers))  # four pixels a period: half of what a projector can show
+    if scale == 1.0:
+        return pattern
+    try:
+        return CompositePattern(axis, tuple(float(int(f * scale)) for f in pattern.carriers))
+    except DecodeError as problem:
+        raise ConfigError(
+            f"a projector of {projector.width} x {projector.height} is too small for cp: {problem}",
+            hint="use pmp, or give carriers of your own",
+        ) from problem
 
 
 def _smaller_mcp(pattern: McpPattern, projector: ProjectorSize) -> McpPattern:

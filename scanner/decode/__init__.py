@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from scanner.decode.stages import Observer
 from scanner.errors import DecodeError
-from scanner.patterns import CameraFormat, McpPattern, PatternSequence, PmpPattern
+from scanner.patterns import CameraFormat, CompositePattern, McpPattern, PatternSequence, PmpPattern
 
 Map = NDArray[np.float32]
 """(H, W) float32, NaN where undecided"""
@@ -126,6 +126,10 @@ def decoder_for(
         from scanner.decode.mcp import McpDecoder  # noqa: PLC0415
 
         return McpDecoder(sequence, camera)
+    if isinstance(sequence.pattern, CompositePattern):
+        from scanner.decode.composite import CompositeDecoder  # noqa: PLC0415
+
+        return CompositeDecoder(sequence, camera)
     from scanner.decode.graycode import GrayDecoder  # noqa: PLC0415
 
     return GrayDecoder(sequence, camera)

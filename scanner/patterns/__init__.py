@@ -1,5 +1,6 @@
 """The images to project, as data: descriptions (formats.md, Pattern descriptions) and the images they stand for."""
 
+from scanner.patterns.composite import CompositePattern
 from scanner.patterns.description import (
     Axis,
     CameraFormat,
@@ -16,6 +17,7 @@ from scanner.patterns.sequence import PatternSequence
 __all__ = [
     "Axis",
     "CameraFormat",
+    "CompositePattern",
     "FrameRole",
     "GrayPattern",
     "McpPattern",

@@ -6,15 +6,17 @@ from collections.abc import Mapping
 from typing import Any
 
 from scanner.errors import DecodeError
+from scanner.patterns.composite import CompositePattern
 from scanner.patterns.description import Pattern
 from scanner.patterns.graycode import GrayPattern
 from scanner.patterns.mcp import McpPattern
 from scanner.patterns.pmp import PmpPattern
 
-_METHODS: Mapping[str, type[PmpPattern] | type[McpPattern] | type[GrayPattern]] = {
+_METHODS: Mapping[str, type[PmpPattern] | type[McpPattern] | type[GrayPattern] | type[CompositePattern]] = {
     "pmp": PmpPattern,
     "mcp": McpPattern,
     "gray": GrayPattern,
+    "cp": CompositePattern,
 }
 
 

@@ -38,6 +38,7 @@ class Method(StrEnum):
     PMP = "pmp"
     MCP = "mcp"
     GRAY = "gray"
+    CP = "cp"
 
 
 # --- patterns -----------------------------------------------------------------------------------------------------
@@ -60,7 +61,8 @@ Bits = Annotated[
     int | None, typer.Option(metavar="N", min=1, max=16, help="MCP: bits of a code word; gray: bits shown.")
 ]
 Carriers = Annotated[
-    str | None, typer.Option(metavar="F,F,...", help="MCP: one carrier a bit, cycles along the stripes.")
+    str | None,
+    typer.Option(metavar="F,F,...", help="MCP: one carrier a bit, cycles along the stripes. CP: one a shift."),
 ]
 Profile = Annotated[str | None, typer.Option(metavar="triangle|cosine", help="MCP: shape of a stripe.")]
 Levels = Annotated[str | None, typer.Option(metavar="equal|composite", help="MCP: equally bright, or as published.")]
@@ -88,6 +90,7 @@ class PatternOptions:
             Method.PMP: {"frequencies", "shifts", "axis"},
             Method.MCP: {"axis", "bits", "carriers", "profile", "levels"},
             Method.GRAY: {"axis", "bits"},
+            Method.CP: {"axis", "carriers"},
         }[method]
         given = {name: value for name, value in vars(self).items() if value is not None}
         for name in given.keys() - allowed:
@@ -130,7 +133,7 @@ def _followed(members: dict[str, Any], method: Method) -> dict[str, Any]:
 
 
 def _axes(text: str, method: Method) -> dict[str, Any]:
-    if method == Method.MCP:
+    if method in (Method.MCP, Method.CP):
         return {"axis": _choice(text, "axis", ("x", "y"))}
     _choice(text, "axis", ("x", "y", "xy", "yx"))
     return {"axes": list(text)}

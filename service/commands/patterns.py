@@ -30,7 +30,7 @@ PATTERN_FILE = "pattern.json"
 
 
 def patterns(
-    method: Annotated[Method, typer.Argument(metavar="METHOD", help="pmp, mcp or gray.")],
+    method: Annotated[Method, typer.Argument(metavar="METHOD", help="pmp, mcp, gray or cp.")],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", parser=output_path, help="Folder to write to.")
     ],
