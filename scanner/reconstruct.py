@@ -17,12 +17,13 @@ import numpy as np
 from scanner.capture import Capture, CaptureHeader
 from scanner.compare import compare
 from scanner.decode import Decoded, Decoder, Reason, decoder_for
-from scanner.decode.stages import Observer
 from scanner.decode.repeated import Repetitions
+from scanner.decode.stages import Observer
 from scanner.devices import Pixels, Truth
 from scanner.errors import CalibrationError, DecodeError
 from scanner.filters import FilterSettings
 from scanner.geometry import Calibration, load_calibration
+from scanner.orientation import require_orientation
 from scanner.patterns import McpPattern, PatternSequence, PmpPattern
 from scanner.scan import Scan, build_scan
 from scanner.sequencer import check_capture
@@ -131,6 +132,7 @@ class Reconstruction:
         if len(self._header.sequence) > 1:
             # The witnesses have seen light: without it the check ends in an error of its own.
             raise_if_empty(decoded)
+        decoded = self._oriented(decoded)
         tell("triangulating")
         scan = build_scan(decoded, self._calibration, self._options.filters, timings=self._timings)
         scan = scan.with_report(sync=check.as_dict(), capture=self._capture_report(capture))
@@ -162,6 +164,16 @@ class Reconstruction:
         absent = self._header.repeat - self._repetitions.count - len(self._failed)
         said = [f"repetition {n + 1} was left out: {error}" for n, error in sorted(self._failed.items())]
         said += [f"{absent} of {self._header.repeat} repetitions have no frames"] if absent else []
+        return replace(decoded, warnings=(*decoded.warnings, *said)) if said else decoded
+
+    def _oriented(self, decoded: Decoded) -> Decoded:
+        if self._calibration is None:
+            return decoded
+        said = [
+            warning
+            for axis, values in (("y", decoded.rows), ("x", decoded.columns))
+            if values is not None and (warning := require_orientation(self._calibration, values, axis)) is not None
+        ]
         return replace(decoded, warnings=(*decoded.warnings, *said)) if said else decoded
 
     def _catch_up(self, capture: Capture) -> None:
