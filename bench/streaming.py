@@ -19,9 +19,11 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+
+import numpy as np
 
 from scanner.client import Client
 from service.config import RigConfig
@@ -35,10 +37,16 @@ LEAST_SHARE, LEAST_RATE = 0.80, 600.0
 RATE_FRAMES = 6 * SERIES
 """Length of the file that tells the disk's own rate: 2.1 GB, longer than what a run has in the spool."""
 
-FLAT_MB = {"spool": 1.05 * SERIES * FRAME_BYTES / 1e6}
+SERIES_MB = SERIES * FRAME_BYTES / 1e6
+FLAT_MB = {"spool": SERIES_MB / 2}
 FLAT_MEMORY_MB = 10.0
-"""Growth from the second quarter of a run to the last that counts as flat: allocators breathe by a few MB, and the
-spool by the series that is just being deleted, with its lines and the rounding of its blocks."""
+"""Drift over a run (slope of a straight line through all samples, times the run) that counts as flat. Allocators
+breathe by a few MB. The spool holds the series being written and at times the one before, so that a sample lies
+anywhere within one series: the slope of 42 such samples is uncertain by a sixth of a series over the run, and half a
+series is three times that. A leak of one hundredth of each series would be seen."""
+
+MOST_SPOOL_MB = (2 + 0.1) * SERIES_MB
+"""The series being written, the one before it until its deletion is through, and their lines."""
 
 
 @dataclass
@@ -52,11 +60,11 @@ class Samples:
         """One sample of everything."""
         for name, pid in processes.items():
             self.memory.setdefault(name, []).append(own_memory_mb(pid))
-        self.spool.append(sum(p.stat().st_blocks * 512 for p in spool.rglob("*") if p.is_file()) / 1e6)
+        self.spool.append(spool_mb(spool))
 
-    def growth(self) -> dict[str, float]:
-        """Most in the last quarter of the run minus most in the second, MB."""
-        return {name: _growth(values) for name, values in {**self.memory, "spool": self.spool}.items()}
+    def drift(self) -> dict[str, float]:
+        """Slope of a straight line through the samples, times the length of the run, MB."""
+        return {name: _drift(values) for name, values in {**self.memory, "spool": self.spool}.items()}
 
 
 def run(spool: Path, frames: int, label: str, *, disk: bool) -> dict[str, object]:
@@ -68,6 +76,7 @@ def run(spool: Path, frames: int, label: str, *, disk: bool) -> dict[str, object
         began, samples = time.perf_counter(), Samples()
         count = stream(client, frames, samples, processes, spool)
         seconds = time.perf_counter() - began
+        left = spool_mb(spool)
     own_rates += [write_rate(spool)] if disk else []
     rate = count / seconds
     found: dict[str, object] = {
@@ -75,9 +84,10 @@ def run(spool: Path, frames: int, label: str, *, disk: bool) -> dict[str, object
         "frames": count,
         "frames_per_s": round(rate, 1),
         "MB_per_s": round(rate * FRAME_BYTES / 1e6, 1),
-        "growth_MB": samples.growth(),
+        "drift_MB": samples.drift(),
         "memory_MB": {name: round(values[-1], 1) for name, values in samples.memory.items()},
         "spool_MB_max": round(max(samples.spool), 1),
+        "spool_MB_left": round(left, 1),
     }
     if disk:
         own = sum(own_rates) / len(own_rates)
@@ -171,6 +181,15 @@ def write_rate(folder: Path) -> float:
     return sorted(rates)[1]
 
 
+def spool_mb(spool: Path) -> float:
+    """Room that files take there, MB. Files may vanish while they are counted."""
+    total = 0
+    for path in spool.rglob("*"):
+        with suppress(FileNotFoundError):
+            total += path.stat().st_blocks * 512
+    return total / 1e6
+
+
 def own_memory_mb(pid: int) -> float:
     """Anonymous resident memory of a process: mapped spool files are page cache, which others may have."""
     for line in Path(f"/proc/{pid}/status").read_text().splitlines():
@@ -185,9 +204,9 @@ def child_of(pid: int) -> int:
     return int(child)
 
 
-def _growth(values: list[float]) -> float:
-    quarter = max(1, len(values) // 4)
-    return round(max(values[-quarter:]) - max(values[quarter : 2 * quarter] or values), 1)
+def _drift(values: list[float]) -> float:
+    at = np.arange(len(values))
+    return round(float(np.polyfit(at, values, 1)[0]) * len(values), 1)
 
 
 def main() -> int:
@@ -205,9 +224,13 @@ def main() -> int:
             problems.append(f"{found['share']} of the disk's own rate, {LEAST_SHARE} wanted")
         if not disk and float(str(found["frames_per_s"])) < LEAST_RATE:
             problems.append(f"{found['frames_per_s']} frames a second from memory, {LEAST_RATE:g} wanted")
-        growth = found["growth_MB"]
-        assert isinstance(growth, dict)
-        problems += [f"{name} grew by {mb} MB" for name, mb in growth.items() if mb > FLAT_MB.get(name, FLAT_MEMORY_MB)]
+        drift = found["drift_MB"]
+        assert isinstance(drift, dict)
+        problems += [f"{name} grew by {mb} MB" for name, mb in drift.items() if mb > FLAT_MB.get(name, FLAT_MEMORY_MB)]
+        if float(str(found["spool_MB_max"])) > MOST_SPOOL_MB:
+            problems.append(f"{found['spool_MB_max']} MB in the spool at once, {MOST_SPOOL_MB:.0f} at most")
+        if float(str(found["spool_MB_left"])) > 1.0:
+            problems.append(f"{found['spool_MB_left']} MB left in the spool after the last series was deleted")
     for problem in problems:
         print(f"missed: {problem}", file=sys.stderr)
     return 1 if problems else 0
