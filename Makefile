@@ -7,7 +7,7 @@ export PYTHONNOUSERSITE := 1
 bin := .venv/bin
 ARGS ?=
 
-.PHONY: help setup scan test check bench docs clean
+.PHONY: help setup scan test rig check bench docs clean
 
 help: ## this list
 	@sed -nE 's/^([a-z]+):.*## (.*)/make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
@@ -20,6 +20,9 @@ scan: setup ## scan the simulated rig; ARGS="--method mcp" and the like are pass
 
 test: setup ## all tests; ARGS="-k config" and the like are passed on
 	@$(bin)/python -m pytest -q $(ARGS)
+
+rig: setup ## the drivers against the kernel's virtual devices, in a guest under QEMU
+	@setup/rig.sh
 
 check: ## format, lint, types, layers
 	@setup/install.sh --no-kernels

@@ -1,0 +1,319 @@
+"""A V4L2 camera: memory-mapped streaming with the kernel's stamps and sequence numbers.
+
+    stopped --start--> streaming --stop--> stopped --close--> closed
+
+It runs freely; V4L2 has no software trigger. Buffers that the program holds or has not fetched are the driver's loss:
+it counts on and drops, which the gap in `frame_id` shows. A stamp is the kernel's, on CLOCK_MONOTONIC where the flags
+say so; whether it is the exposure's is another matter: uvcvideo by default stamps the first packet that reached the
+host and calls it the start of exposure. So stamps are `estimated` until the rig file gives the measured delay.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drivers.v4l2 import controls, formats, timings
+from drivers.v4l2.node import VideoNode, open_node
+from drivers.v4l2.options import CameraOptions
+from drivers.v4l2.queue import SLICE_MS, BufferQueue, Dequeued
+from scanner.clock import Clock
+from scanner.devices import (
+    CameraCapabilities,
+    CameraFrame,
+    CameraSettings,
+    Exposure,
+    Source,
+    TriggerMode,
+)
+from scanner.errors import ConfigError, DeviceBusy, DeviceError
+
+STAMP_ROUNDING_NS = 1000
+"""Stamps of v4l2_buffer are whole microseconds, cut off"""
+
+EXPOSURE_UNIT_NS = 100_000
+"""V4L2_CID_EXPOSURE_ABSOLUTE counts in 100 us"""
+
+CLOCK_SLACK_NS = 1_000_000
+"""A stamp further than this in the future is of another clock"""
+
+
+@dataclass(frozen=True)
+class _ExposureControl:
+    """How the exposure is set; None where it cannot be."""
+
+    control: controls.Control
+    unit_ns: int
+
+
+class V4l2Camera:
+    """See `scanner.devices.Camera`."""
+
+    def __init__(self, path: str, options: CameraOptions, clock: Clock) -> None:
+        """Open, switch the automatic functions off, set format, rate and controls, and take the buffers.
+
+        Raises:
+            ConfigError: an option that this device does not have or take.
+            DeviceError: see `open_node`; DeviceBusy also when somebody else streams.
+        """
+        self._node, self._found = open_node(path, "camera")
+        self._name = f"{self._found.card} ({path})"
+        self._node.name = self._name
+        self._options = options
+        self._clock = clock
+        self._queue: BufferQueue | None = None
+        self._streaming = False
+        self._lent: int | None = None
+        self._begun_ns = 0
+        try:
+            kind = self._found.buffer_type("camera")
+            assert kind is not None  # noqa: S101  # open_node made sure
+            self._kind = kind
+            self._set_up()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def name(self) -> str:
+        """The device's name in messages."""
+        return self._name
+
+    @property
+    def node(self) -> VideoNode:
+        """What the node says of itself."""
+        return self._found
+
+    @property
+    def frame_format(self) -> formats.FrameFormat:
+        """The format agreed with the driver."""
+        return self._format
+
+    @property
+    def automatics(self) -> dict[str, int]:
+        """Automatic functions that were switched off at opening, and the value that was read back."""
+        return dict(self._automatics)
+
+    @property
+    def capabilities(self) -> CameraCapabilities:
+        """What it can do with the settings last applied."""
+        low, high, step = self._exposure_bounds()
+        measured = self._options.stamp_delay_us is not None
+        return CameraCapabilities(
+            width=self._format.width,
+            height=self._format.height,
+            bits=self._capture.bits,
+            shutter=self._options.shutter,
+            readout_ns=self._readout_ns,
+            exposure_min_ns=low,
+            exposure_max_ns=high,
+            exposure_step_ns=step,
+            min_gap_ns=max(0, self._period_ns - self._exposure_ns),
+            trigger_modes=frozenset({TriggerMode.FREE}),
+            stamp=Source.DRIVER if measured else Source.ESTIMATED,
+            stamp_bound_ns=self._bound_ns,
+        )
+
+    def apply(self, settings: CameraSettings) -> CameraSettings:
+        """Set and read back; see `scanner.devices.Camera.apply`."""
+        self._check_open()
+        if self._streaming:
+            raise DeviceBusy("settings change while the camera is stopped", device=self._name, hint="stop it first")
+        self._check(settings)
+        self._require_queue().check_alive()
+        if settings.pixel_format is not None:
+            self._set_format(settings.pixel_format)
+        if settings.exposure_ns is not None:
+            self._exposure_ns = self._set_exposure(settings.exposure_ns)
+        whole = (0, 0, self._format.width, self._format.height)
+        return CameraSettings(self._exposure_ns, 0.0, self._capture.code, whole)
+
+    def start(self, mode: TriggerMode) -> None:
+        """Begin to stream; see `scanner.devices.Camera.start`."""
+        self._check_open()
+        if mode is not TriggerMode.FREE:
+            raise ConfigError(f"no trigger mode {mode.value!r} on this camera", device=self._name, hint="free")
+        if self._streaming:
+            raise DeviceBusy("the camera is streaming already", device=self._name, hint="stop it first")
+        queue = self._require_queue()
+        for index in range(len(queue)):
+            queue.put(index)
+        self._begun_ns = self._clock.now_ns()
+        queue.on()
+        self._streaming = True
+
+    def trigger(self) -> None:
+        """Refused: V4L2 knows no software trigger."""
+        self._check_open()
+        raise DeviceError("this camera has no software trigger", device=self._name, hint="it runs freely")
+
+    def pop(self, timeout_ns: int) -> CameraFrame | None:
+        """The next frame; see `scanner.devices.Camera.pop`."""
+        self._check_open()
+        if not self._streaming:
+            raise DeviceError("the camera is not streaming", device=self._name, hint="start it first")
+        queue = self._require_queue()
+        if self._lent is not None:
+            queue.put(self._lent)
+            self._lent = None
+        deadline = self._clock.now_ns() + max(0, timeout_ns)
+        while True:
+            left_ms = -(-(deadline - self._clock.now_ns()) // 1_000_000)
+            if (taken := queue.take(min(left_ms, SLICE_MS))) is not None:
+                self._lent = taken.index
+                return self._frame(taken, queue)
+            if left_ms <= 0:
+                return None
+
+    def stop(self) -> None:
+        """End streaming. May be called twice."""
+        if self._streaming and self._queue is not None:
+            self._queue.off()
+        self._streaming = False
+        self._lent = None
+
+    def close(self) -> None:
+        """Give the device back. May be called twice."""
+        self.stop()
+        if self._queue is not None:
+            self._queue.release()
+            self._queue = None
+        self._node.close()
+
+    def _set_up(self) -> None:
+        options = self._options
+        if options.mode is not None:
+            if not timings.set_timings(self._node, options.mode):
+                raise ConfigError("this camera has no video timings", device=self._name, hint="use size and fps")
+        else:
+            timings.follow_signal(self._node)
+        self._automatics = controls.switch_automatics_off(self._node, frozenset(options.keep))
+        self._set_format(options.pixel_format)
+        for name, value in options.controls.items():
+            controls.write_named(self._node, name, value)
+        self._exposure_control = self._find_exposure()
+        self._exposure_ns = self._read_exposure()
+
+    def _set_format(self, wanted: str | None) -> None:
+        code = formats.choose(self._node, self._kind, wanted, formats.CAPTURE_FORMATS)
+        if self._queue is not None:
+            self._queue.release()  # a driver refuses another format while buffers of the old one are held
+            self._queue = None
+        self._format = formats.agree(self._node, self._kind, code, self._options.size)
+        self._capture = formats.CAPTURE_FORMATS[code]
+        if self._options.fps is not None:
+            timings.set_rate(self._node, self._kind, self._options.fps)
+        self._period_ns = timings.period_ns(self._node, self._kind)
+        self._queue = BufferQueue(self._node, self._kind, self._options.buffers)
+
+    def _check(self, settings: CameraSettings) -> None:
+        """Raise ConfigError before anything is set."""
+        whole = (0, 0, self._format.width, self._format.height)
+        if settings.region is not None and tuple(settings.region) != whole:
+            raise ConfigError(
+                f"region {list(settings.region)} is not offered",
+                device=self._name,
+                hint=f"this driver takes the whole frame, {list(whole)}; options.size asks for another",
+            )
+        if settings.gain_db:
+            raise ConfigError(
+                f"gain {settings.gain_db:g} dB lies outside 0 .. 0 dB",
+                device=self._name,
+                hint="V4L2 gains are not in dB: set options.controls.gain, in the camera's own units",
+            )
+        if settings.pixel_format is not None:
+            formats.choose(self._node, self._kind, settings.pixel_format, formats.CAPTURE_FORMATS)
+        low, high, _ = self._exposure_bounds()
+        if settings.exposure_ns is not None and not low <= settings.exposure_ns <= high:
+            raise ConfigError(
+                f"exposure {settings.exposure_ns / 1e3:g} us lies outside {low / 1e3:g} .. {high / 1e3:g} us",
+                device=self._name,
+                hint="the longest exposure is the frame period: a lower fps allows more"
+                if self._exposure_control
+                else "this camera has no exposure control",
+            )
+
+    def _find_exposure(self) -> _ExposureControl | None:
+        by_id = {control.id: control for control in controls.controls(self._node).values()}
+        unit_us = self._options.exposure_unit_us
+        absolute, driver_own = by_id.get(controls.EXPOSURE_ABSOLUTE), by_id.get(controls.EXPOSURE)
+        if absolute is not None and absolute.settable:
+            return _ExposureControl(absolute, round(1e3 * unit_us) if unit_us else EXPOSURE_UNIT_NS)
+        if driver_own is not None and driver_own.settable and unit_us:
+            return _ExposureControl(driver_own, round(1e3 * unit_us))
+        return None
+
+    def _exposure_bounds(self) -> tuple[int, int, int]:
+        """Shortest, longest and step, ns. No longer than a period: what is beyond it, the camera cuts off."""
+        means = self._exposure_control
+        if means is None:
+            return self._exposure_ns, self._exposure_ns, 1000
+        step = max(means.control.step, 1) * means.unit_ns
+        low = max(means.control.minimum * means.unit_ns, step)
+        longest = min(means.control.maximum * means.unit_ns, self._period_ns)
+        return low, max(low, low + (longest - low) // step * step), step
+
+    def _set_exposure(self, exposure_ns: int) -> int:
+        means = self._exposure_control
+        if means is None:
+            return self._exposure_ns
+        step = max(means.control.step, 1)
+        units = means.control.minimum + (exposure_ns // means.unit_ns - means.control.minimum) // step * step
+        return controls.write(self._node, means.control, max(units, means.control.minimum)) * means.unit_ns
+
+    def _read_exposure(self) -> int:
+        means = self._exposure_control
+        if means is None:
+            given = self._options.exposure_us
+            return self._period_ns if given is None else round(1e3 * given)
+        now = controls.read(self._node, means.control) * means.unit_ns
+        low, high, _ = self._exposure_bounds()
+        return now if low <= now <= high else self._set_exposure(min(max(now, low), high))
+
+    @property
+    def _readout_ns(self) -> int:
+        given = self._options.readout_us
+        return self._period_ns if given is None else round(1e3 * given)
+
+    @property
+    def _bound_ns(self) -> int:
+        """What every stamp keeps: half the measured delay's spread, or without one two periods, a belief."""
+        measured = self._options.stamp_delay_us
+        if measured is None:
+            return 2 * self._period_ns
+        return round(500 * (measured[1] - measured[0])) + STAMP_ROUNDING_NS
+
+    def _frame(self, taken: Dequeued, queue: BufferQueue) -> CameraFrame:
+        pixels = self._capture.unpack(queue.views[taken.index][: taken.bytes_used], self._format)
+        complete = pixels is not None and not taken.damaged
+        if pixels is None:
+            pixels = self._capture.black(self._format)
+        return CameraFrame(pixels, taken.sequence, self._exposure(taken), complete)
+
+    def _exposure(self, taken: Dequeued) -> Exposure:
+        rolling = self._options.shutter == "rolling"
+        length = self._exposure_ns + (self._readout_ns if rolling else 0)
+        now = self._clock.now_ns()
+        believable = taken.monotonic and self._begun_ns - self._period_ns <= taken.t_ns <= now + CLOCK_SLACK_NS
+        measured = self._options.stamp_delay_us
+        if measured is not None:
+            if not believable:
+                raise DeviceError(
+                    "the driver's time stamps are not of CLOCK_MONOTONIC",
+                    device=self._name,
+                    hint="take stamp_delay_us out of the rig file: without good stamps it means nothing",
+                )
+            start = taken.t_ns - round(500 * (measured[0] + measured[1]))
+            return Exposure(start, start + length, self._bound_ns, Source.DRIVER)
+        if not believable:
+            return Exposure(now - length, now, self._bound_ns, Source.ESTIMATED)
+        start = taken.t_ns if taken.start_of_exposure else taken.t_ns - self._exposure_ns - self._readout_ns
+        return Exposure(start, start + length, self._bound_ns, Source.ESTIMATED)
+
+    def _require_queue(self) -> BufferQueue:
+        if self._queue is None:
+            raise DeviceError("the camera has no buffers", device=self._name, hint="open it again")
+        return self._queue
+
+    def _check_open(self) -> None:
+        if not self._node.open:
+            raise DeviceError("the camera is closed", device=self._name)
