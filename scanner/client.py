@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -21,7 +22,7 @@ import zmq
 import zmq.asyncio
 
 from scanner.client_asyncio import AsyncClient
-from scanner.client_sockets import WELCOME_S, configured, loaded, probe, send, single
+from scanner.client_sockets import WELCOME_S, configured, conflated, loaded, probe, send, single
 from scanner.errors import ScannerError
 from scanner.session import (
     QUIET_S,
@@ -41,6 +42,7 @@ from scanner.session import (
 from scanner.wire import DEFAULT_ENDPOINT, WELCOME, Event
 
 if TYPE_CHECKING:
+    from scanner.live import LiveFrame
     from scanner.scan import Scan
 
 __all__ = ["AsyncClient", "Client", "OnEvent"]
@@ -170,6 +172,66 @@ class Client:
     def delete(self, job_id: str) -> None:
         """Delete a scan's files on the daemon now."""
         self.call("scan.delete", id=job_id)
+
+    @contextmanager
+    def live(self, *, stop: bool = True, **params: Any) -> Iterator[Iterator[LiveFrame]]:
+        """Start a live run and read its results; it is stopped at the end of the block.
+
+            with client.live(content="xyz", stride=2) as frames:
+                for frame in frames:
+                    print(frame.number, frame.latency_ms, frame.xyz)
+
+        Args:
+            stop: False leaves the run going.
+            params: of `live.start`, see docs/reference/protocol.md.
+
+        Raises:
+            DeviceBusy: a scan or another live run has the devices.
+            ScannerError: while reading: why the run failed, as its class.
+        """
+        job_id = self.live_start(**params)["id"]
+        frames = self.live_frames(job_id)
+        try:
+            yield frames
+        finally:
+            frames.close()
+            if stop:
+                self.live_stop(job_id)
+
+    def live_start(self, job_id: str | None = None, **params: Any) -> dict[str, Any]:
+        """Start a live run; its state, with the `endpoint` of the results."""
+        from scanner.live import live_start_call  # noqa: PLC0415  (clients that want no arrays do not load them)
+
+        return dict(self._run(single(live_start_call(job_id, params))))
+
+    def live_frames(self, job_id: str) -> Generator[LiveFrame, None, None]:
+        """Results of a live run, the newest each time, until it is over.
+
+        Raises:
+            ScannerError: why it failed, as its class.
+        """
+        from scanner.live import QUIET_S, LiveWatch  # noqa: PLC0415
+
+        watch = LiveWatch(job_id)
+        live = conflated(self._context.socket(zmq.SUB), self._endpoints["live"])
+        try:
+            while not watch.finished:
+                if live.poll(int(QUIET_S * 1e3)):
+                    frame = watch.result(live.recv())
+                    if frame is not None:
+                        yield frame
+                else:
+                    watch.state(self.call("live.status"))
+        finally:
+            live.close()
+
+    def live_stop(self, job_id: str | None = None) -> dict[str, Any]:
+        """End a live run; its state once the devices are free. A recording is whole when its job is done (`wait`)."""
+        return dict(self.call("live.stop", id=job_id))
+
+    def live_status(self) -> dict[str, Any] | None:
+        """The live run under way, or the last one: state, counts, rates, latency; None where there was none."""
+        return self.call("live.status")["run"]  # type: ignore[no-any-return]
 
     def preview_start(self, **params: Any) -> str:
         """Start the preview; returns the endpoint to subscribe to (ZMQ_SUB with ZMQ_CONFLATE)."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import tempfile
 import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import suppress
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import zmq
 import zmq.asyncio
 
-from scanner.client_sockets import WELCOME_S, configured, loaded, probe, send, single
+from scanner.client_sockets import WELCOME_S, configured, conflated, loaded, probe, send, single
 from scanner.errors import ProtocolError, ScannerError
 from scanner.session import (
     QUIET_S,
@@ -34,6 +34,7 @@ from scanner.session import (
 from scanner.wire import DEFAULT_ENDPOINT, Event
 
 if TYPE_CHECKING:
+    from scanner.live import LiveFrame
     from scanner.scan import Scan
 
 OnEvent = Callable[[Event], None]
@@ -169,6 +170,51 @@ class AsyncClient:
     async def delete(self, job_id: str) -> None:
         """Delete a scan's files on the daemon now."""
         await self.call("scan.delete", id=job_id)
+
+    @asynccontextmanager
+    async def live(self, *, stop: bool = True, **params: Any) -> AsyncIterator[AsyncIterator[LiveFrame]]:
+        """Start a live run and read its results: `async with client.live() as frames`, `async for frame in frames`."""
+        job_id = (await self.live_start(**params))["id"]
+        frames = self.live_frames(job_id)
+        try:
+            yield frames
+        finally:
+            await frames.aclose()
+            if stop:
+                await self.live_stop(job_id)
+
+    async def live_start(self, job_id: str | None = None, **params: Any) -> dict[str, Any]:
+        """Start a live run; its state, with the `endpoint` of the results."""
+        from scanner.live import live_start_call  # noqa: PLC0415  (clients that want no arrays do not load them)
+
+        return dict(await self._run(single(live_start_call(job_id, params))))
+
+    async def live_frames(self, job_id: str) -> AsyncGenerator[LiveFrame, None]:
+        """Results of a live run, the newest each time, until it is over."""
+        from scanner.live import QUIET_S, LiveWatch  # noqa: PLC0415
+
+        if self._context is None:
+            raise ProtocolError("the client is closed")
+        watch = LiveWatch(job_id)
+        live = conflated(self._context.socket(zmq.SUB), self._endpoints["live"])
+        try:
+            while not watch.finished:
+                if await live.poll(int(QUIET_S * 1e3)):
+                    frame = watch.result(await live.recv())
+                    if frame is not None:
+                        yield frame
+                else:
+                    watch.state(await self.call("live.status"))
+        finally:
+            live.close()
+
+    async def live_stop(self, job_id: str | None = None) -> dict[str, Any]:
+        """End a live run; its state once the devices are free."""
+        return dict(await self.call("live.stop", id=job_id))
+
+    async def live_status(self) -> dict[str, Any] | None:
+        """The live run under way, or the last one."""
+        return (await self.call("live.status"))["run"]  # type: ignore[no-any-return]
 
     async def preview_start(self, **params: Any) -> str:
         """Start the preview; returns the endpoint to subscribe to."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import zmq
 
 from scanner.session import Call, Procedure, socket_file, unreachable
-from scanner.wire import MAX_MESSAGE_BYTES
+from scanner.wire import MAX_LIVE_BYTES, MAX_MESSAGE_BYTES
 
 if TYPE_CHECKING:
     from scanner.scan import Scan
@@ -50,6 +50,18 @@ def configured(opened: _Socket) -> _Socket:
     opened.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
     opened.setsockopt(zmq.RECONNECT_IVL, 50)
     opened.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
+    return opened
+
+
+def conflated(opened: _Socket, endpoint: str) -> _Socket:
+    """A SUB socket on the live endpoint that holds the newest result alone."""
+    opened.setsockopt(zmq.LINGER, 0)
+    opened.setsockopt(zmq.CONFLATE, 1)
+    opened.setsockopt(zmq.MAXMSGSIZE, MAX_LIVE_BYTES)
+    opened.setsockopt(zmq.RECONNECT_IVL, 50)
+    opened.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
+    opened.setsockopt(zmq.SUBSCRIBE, b"")
+    opened.connect(endpoint)
     return opened
 
 

@@ -77,7 +77,7 @@ class Reconstruction:
     ) -> None:
         """Raise DecodeError or CalibrationError at once where these frames cannot become a scan."""
         if calibration is not None:
-            _require_sizes(header, calibration)
+            require_sizes(header, calibration)
         self._header = header
         self._calibration = calibration
         self._options = options
@@ -235,7 +235,8 @@ def reconstruct(
     return reconstruction.finish(capture, progress)
 
 
-def _require_sizes(header: CaptureHeader, calibration: Calibration) -> None:
+def require_sizes(header: CaptureHeader, calibration: Calibration) -> None:
+    """Raise CalibrationError where camera or projector of the capture have another size than the calibration's."""
     projector = header.sequence.projector
     for name, calibrated, here, hint in (
         ("camera", calibration.camera.size, header.camera.shape[::-1], "made with this camera and region"),

@@ -196,22 +196,8 @@ def build_scan(
     reason = decoded.reason
     removed: dict[str, int] = {}
     if calibration is not None:
-        with _timed(timings, "triangulate"):
-            found = triangulate(
-                calibration,
-                rows=decoded.rows,
-                columns=decoded.columns,
-                sigma_rows=decoded.sigma_rows,
-                sigma_columns=decoded.sigma_columns,
-            )
-        with _timed(timings, "filter"):
-            falls, removed = apply_filters(found.xyz, found.sigma_z, decoded.confidence, settings)
-            found.xyz[falls] = np.nan
-            found.sigma_z[falls] = np.nan
-            removed = {"impossible": found.impossible, **removed}
-            xyz, sigma_z = found.xyz, found.sigma_z
-            reason = decoded.reason.copy()
-            reason[(reason == Reason.VALUE) & np.isnan(xyz[..., 2])] = Reason.FILTERED
+        points = filtered_points(decoded, calibration, settings, timings=timings)
+        xyz, sigma_z, reason, removed = points.xyz, points.sigma_z, points.reason, points.removed
     scan = Scan(
         **{name: getattr(decoded, name) for name in _MAPS if name != "sigma_z"},
         reason=reason,
@@ -223,6 +209,47 @@ def build_scan(
     with _timed(timings, "normals"):
         _ = scan.normals
     return _with_same_normals(scan, _report(scan, decoded, calibration, settings, removed, timings))
+
+
+@dataclass(frozen=True, eq=False)
+class FilteredPoints:
+    """Points on the camera's grid, and why there is none: xyz (H, W, 3), sigma_z (H, W), reason (H, W) as in `Scan`."""
+
+    xyz: Map
+    sigma_z: Map
+    reason: NDArray[np.uint8]
+    removed: dict[str, int]
+    """points that could not be, and those that each filter took"""
+
+
+def filtered_points(
+    decoded: Decoded,
+    calibration: Calibration,
+    settings: FilterSettings,
+    *,
+    timings: dict[str, float] | None = None,
+) -> FilteredPoints:
+    """Triangulate decoded maps and take out what the filters find.
+
+    Raises:
+        CalibrationError: see `scanner.triangulation.triangulate`.
+    """
+    timings = {} if timings is None else timings
+    with _timed(timings, "triangulate"):
+        found = triangulate(
+            calibration,
+            rows=decoded.rows,
+            columns=decoded.columns,
+            sigma_rows=decoded.sigma_rows,
+            sigma_columns=decoded.sigma_columns,
+        )
+    with _timed(timings, "filter"):
+        falls, removed = apply_filters(found.xyz, found.sigma_z, decoded.confidence, settings)
+        found.xyz[falls] = np.nan
+        found.sigma_z[falls] = np.nan
+        reason = decoded.reason.copy()
+        reason[(reason == Reason.VALUE) & np.isnan(found.xyz[..., 2])] = Reason.FILTERED
+    return FilteredPoints(found.xyz, found.sigma_z, reason, {"impossible": found.impossible, **removed})
 
 
 def load_scan(folder: Path) -> Scan:

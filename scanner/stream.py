@@ -141,6 +141,59 @@ class End(Struct, frozen=True, tag="end"):
     """pattern indices without a frame"""
 
 
+class LiveBegin(Struct, frozen=True, tag="live"):
+    """Daemon: a live run begins: each frame is decoded by itself and its result published, the newest first of all."""
+
+    delivery: int
+    job: str
+    header: dict[str, Any]
+    """as capture.json has it: pattern, projector, camera"""
+    calibration: dict[str, Any] | None
+    endpoint: str
+    """the socket to bind and publish on"""
+    first: int
+    """number of the first frame that is this worker's to decode or to count as dropped"""
+    content: Literal["rows", "xyz"] = "rows"
+    stride: int = 1
+    options: dict[str, Any] = {}
+
+
+class LiveFrame(Struct, frozen=True, tag="live_frame"):
+    """Daemon: one camera frame of a live run. Where it waits and a newer one comes, it is dropped and counted."""
+
+    delivery: int
+    number: int
+    path: str
+    offset: int
+    xxh3: str
+    """of the pixels; where it differs, the frame was overwritten by newer ones and counts as dropped"""
+    frame_id: int
+    start_ns: int
+    end_ns: int
+
+
+class LiveCounts(Struct, frozen=True, tag="live_counts"):
+    """Worker: what was done since the last of these."""
+
+    delivery: int
+    next: int
+    """number of the first frame that is not counted yet, here or before"""
+    decoded: int
+    undecodable: int
+    """published as a result without values"""
+    dropped: int
+    latency: list[tuple[int, int]]
+    """exposure's end to published: (half milliseconds, count)"""
+    largest_ms: float
+    decode_ms: float
+    """mean time of decoding one frame; 0 where there was none"""
+    points: int = 0
+    """of the newest result"""
+    threads: int = 1
+    problem: str | None = None
+    """why the newest undecodable frame was"""
+
+
 class Cancel(Struct, frozen=True, tag="cancel"):
     """Daemon: let this series go."""
 
@@ -155,8 +208,8 @@ class Stop(Struct, frozen=True, tag="stop"):
     """Daemon: finish and exit."""
 
 
-FromWorker = Ready | Alive | Ack | Progress | DecodedNote | Result | Failed | Released | Leaving
-ToWorker = Start | Frame | End | Cancel | Identify | Stop
+FromWorker = Ready | Alive | Ack | Progress | DecodedNote | Result | LiveCounts | Failed | Released | Leaving
+ToWorker = Start | Frame | End | LiveBegin | LiveFrame | Cancel | Identify | Stop
 
 _from_worker: msgspec.msgpack.Decoder[FromWorker] = msgspec.msgpack.Decoder(FromWorker)
 _to_worker: msgspec.msgpack.Decoder[ToWorker] = msgspec.msgpack.Decoder(ToWorker)

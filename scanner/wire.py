@@ -7,10 +7,10 @@ from these types.
 
 from __future__ import annotations
 
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
-from msgspec import UNSET, Struct, UnsetType
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from scanner.errors import ProtocolError, ScannerError, from_data
 
@@ -27,6 +27,12 @@ MAX_FETCH_BYTES = 4 << 20
 
 MAX_MESSAGE_BYTES = 8 << 20
 """Larger messages are not received at all: ZeroMQ drops the connection (ZMQ_MAXMSGSIZE)."""
+
+MAX_LIVE_BYTES = 64 << 20
+"""The same for live results: 5 megapixels of XYZ."""
+
+MAX_STRIDE = 64
+"""Live XYZ is thinned by this at most."""
 
 TERMINAL_STATES = frozenset({"done", "failed", "cancelled"})
 """States that a job does not leave."""
@@ -108,6 +114,36 @@ class PreviewHeader(Struct, frozen=True, kw_only=True):
     """camera pixels per preview pixel"""
 
 
+class LiveHeader(Struct, frozen=True, kw_only=True):
+    """Header of a live result. Times are CLOCK_MONOTONIC, ns."""
+
+    number: int
+    """counts camera frames of this run from 0: a difference above 1 is what was dropped in between"""
+    job: str
+    content: Literal["rows", "columns", "xyz"]
+    width: int
+    height: int
+    """of the image that follows, px; 0 where there is none (`error`)"""
+    dtype: Literal["uint16", "float32"]
+    stride: int = 1
+    """camera pixels from one value to the next, both ways"""
+    scale: float = 0.0
+    """rows and columns: value = round((row + 0.5) * scale), 0 = none; xyz: 0"""
+    points: int = 0
+    """pixels of the camera's image with a value (xyz: with a point, after the filters)"""
+    frame_id: int = 0
+    """the camera's own count"""
+    start_ns: int = 0
+    end_ns: int = 0
+    """the frame's exposure, first row's start to last row's end"""
+    sent_ns: int = 0
+    """when this message was given to the socket: minus `end_ns` it is the latency"""
+    decode_ms: float = 0.0
+    """time of decoding and, for xyz, of triangulation and filters"""
+    error: str | None = None
+    """why this frame gave nothing"""
+
+
 # --- parameters ---------------------------------------------------------------------------------------------------
 
 
@@ -145,6 +181,34 @@ class ScanStart(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=T
     filters: FilterParams = FilterParams()
     compare_truth: bool = False
     repeat: int = 1
+
+
+class LiveStart(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A live run to start: one pattern stays on, and every camera frame becomes a result."""
+
+    job_id: str
+    method: Literal["mcp"] = "mcp"
+    pattern: dict[str, Any] | None = None
+    exposure: float | Literal["auto"] | None = None
+    """microseconds; "auto" measures; None: what the rig file says"""
+    decoder: str = "default"
+    content: Literal["rows", "xyz"] = "rows"
+    """rows: projector rows (columns where the pattern measures those), uint16; xyz: float32, mm"""
+    stride: Annotated[int, Meta(ge=1, le=MAX_STRIDE)] = 1
+    """xyz: every so many pixels both ways"""
+    filters: FilterParams = FilterParams()
+    """xyz: which points are left out"""
+    retain: Literal["none", "ring", "record"] = "none"
+    """frames kept: none; the last `ring_s` seconds; all"""
+    ring_s: Annotated[float, Meta(gt=0, le=3600)] = 10.0
+    seconds: Annotated[float, Meta(gt=0)] | None = None
+    """the run ends by itself after this long; None: when it is stopped"""
+
+
+class LiveStop(Struct, frozen=True, forbid_unknown_fields=True):
+    """End a live run; without an id whichever runs."""
+
+    id: str | None = None
 
 
 class JobRef(Struct, frozen=True, forbid_unknown_fields=True):
@@ -186,6 +250,7 @@ _requests = msgspec.msgpack.Decoder(Request)
 _responses = msgspec.msgpack.Decoder(Response)
 _notifications = msgspec.msgpack.Decoder(Notification)
 _headers = msgspec.msgpack.Decoder(PreviewHeader)
+_live_headers = msgspec.msgpack.Decoder(LiveHeader)
 
 
 def encode(message: Struct) -> bytes:
@@ -319,6 +384,31 @@ def decode_preview(data: bytes) -> tuple[PreviewHeader, memoryview]:
     return header, pixels
 
 
+def encode_live(header: LiveHeader, values: bytes | memoryview) -> bytes:
+    """One part: 4-byte little-endian length of the header, header, values (little-endian, row by row)."""
+    head = _encoder.encode(header)
+    return b"".join((len(head).to_bytes(4, "little"), head, values))
+
+
+def decode_live(data: bytes) -> tuple[LiveHeader, memoryview]:
+    """Header and values of a live result: height x width (x 3 for xyz).
+
+    Raises:
+        ProtocolError: it is none, or its length contradicts its header.
+    """
+    view = memoryview(data)
+    length = int.from_bytes(view[:4], "little")
+    try:
+        header = _live_headers.decode(view[4 : 4 + length])
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise ProtocolError(f"not a live result: {error}") from error
+    values = view[4 + length :]
+    each = {"uint16": 2, "float32": 4}[header.dtype] * (3 if header.content == "xyz" else 1)
+    if header.width < 0 or header.height < 0 or len(values) != header.width * header.height * each:
+        raise ProtocolError(f"a live result of {header.width} x {header.height} with {len(values)} bytes")
+    return header, values
+
+
 # --- endpoints ----------------------------------------------------------------------------------------------------
 
 
@@ -342,7 +432,7 @@ def ipc_path(endpoint: str) -> str:
 
 
 def sibling(endpoint: str, name: str) -> str:
-    """The endpoint of another socket of the same daemon: events, preview or worker."""
+    """The endpoint of another socket of the same daemon: events, preview, live or worker."""
     folder, _, file = ipc_path(endpoint).rpartition("/")
     stem = file.removesuffix(".ipc")
     return f"ipc://{folder}/{name if stem == 'control' else f'{stem}-{name}'}.ipc"

@@ -24,6 +24,9 @@ from scanner.stream import (
     Frame,
     Identify,
     Leaving,
+    LiveBegin,
+    LiveCounts,
+    LiveFrame,
     Progress,
     Ready,
     Released,
@@ -35,12 +38,14 @@ from scanner.wire import (
     PROTOCOL,
     Event,
     FileEntry,
+    LiveHeader,
     Notification,
     PreviewHeader,
     Refused,
     Request,
     Response,
     encode,
+    encode_live,
     encode_preview,
     error_body,
 )
@@ -51,6 +56,31 @@ SHA = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
 BEGIN, END = "<!-- examples: begin -->", "<!-- examples: end -->"
 
 _FILE = FileEntry("scan.npz", 2843430, SHA)
+
+LIVE_JOB = "5d0e2f7c-7c1a-4b0e-9a53-0a4f5f7f1d22"
+
+_LIVE = {
+    "endpoint": "ipc:///run/fringed/live.ipc",
+    "content": "xyz",
+    "stride": 2,
+    "retain": "ring",
+    "seconds": 12.5,
+    "captured": 750,
+    "lost": 0,
+    "decoded": 740,
+    "undecodable": 2,
+    "dropped": 7,
+    "points": 1342868,
+    "decode_ms": 14.2,
+    "threads": 2,
+    "problem": None,
+    "frames_per_s": 60.0,
+    "results_per_s": 59.5,
+    "latency_ms": {"count": 742, "p50": 24.5, "p90": 31.0, "p99": 38.5, "max": 61.2},
+    "recorded": {"frames": 512, "bytes": 741212160},
+    "header": None,
+    "calibration": None,
+}
 
 CALLS: tuple[tuple[str, dict[str, Any], Any], ...] = (
     (
@@ -69,7 +99,7 @@ CALLS: tuple[tuple[str, dict[str, Any], Any], ...] = (
             "endpoints": {
                 "events": "ipc:///run/fringed/events.ipc",
                 "preview": "ipc:///run/fringed/preview.ipc",
-                "live": None,
+                "live": "ipc:///run/fringed/live.ipc",
                 "worker": "ipc:///run/fringed/worker.ipc",
             },
         },
@@ -171,6 +201,29 @@ CALLS: tuple[tuple[str, dict[str, Any], Any], ...] = (
     ("scan.cancel", {"id": JOB}, {"number": 58, "id": JOB, "state": "cancelled", "reason": "cancelled"}),
     ("scan.list", {}, {"number": 90, "scans": [{"id": JOB, "state": "done"}]}),
     ("scan.delete", {"id": JOB}, {"number": 91, "id": JOB, "state": "done", "deleted": True}),
+    (
+        "live.start",
+        {"job_id": LIVE_JOB, "content": "xyz", "stride": 2, "retain": "ring", "ring_s": 10.0},
+        {
+            "number": 95,
+            "id": LIVE_JOB,
+            "kind": "live",
+            "method": "mcp",
+            "state": "queued",
+            "reason": None,
+            "captured": 0,
+            "total": 0,
+            "stage": "",
+            "created": 1795311700.5,
+            "ended": None,
+            "acknowledged": False,
+            "deleted": False,
+            "error": None,
+            "endpoint": "ipc:///run/fringed/live.ipc",
+        },
+    ),
+    ("live.status", {}, {"number": 99, "run": {"id": LIVE_JOB, "kind": "live", "state": "acquiring", "live": _LIVE}}),
+    ("live.stop", {"id": LIVE_JOB}, {"number": 104, "id": LIVE_JOB, "kind": "live", "state": "acquired"}),
     ("preview.start", {"rate_hz": 10.0, "max_width": 480}, {"endpoint": "ipc:///run/fringed/preview.ipc"}),
     ("preview.stop", {}, {}),
     ("shutdown", {}, {}),
@@ -179,6 +232,7 @@ CALLS: tuple[tuple[str, dict[str, Any], Any], ...] = (
 EVENTS: tuple[Event, ...] = (
     Event(42, "queued", JOB, {"state": "queued"}),
     Event(44, "frame", JOB, {"state": "acquiring", "captured": 11, "total": 31, "retakes": 0}),
+    Event(97, "live.counts", LIVE_JOB, {"state": "acquiring", "captured": 690, "decoded": 681, "dropped": 7}),
     Event(60, "decoding", JOB, {"state": "decoding", "stage": "triangulating"}),
     Event(61, "worker.lost", None, {"worker": "rig-812", "why": "ended with status -9"}),
 )
@@ -212,6 +266,11 @@ STREAM: tuple[Struct, ...] = (
     End(DELIVERY, "completed", 31, []),
     Progress(DELIVERY, "triangulating"),
     DecodedNote(DELIVERY, [_FILE], {"points": 76800}),
+    LiveBegin(DELIVERY, LIVE_JOB, {"format": "fringed-capture"}, None, "ipc:///run/fringed/live.ipc", 0),
+    LiveFrame(
+        DELIVERY, 17, f"/spool/{LIVE_JOB}/capture/ring", 24610560, "c8d3a1f27e5b9064", 17, 10**12, 10**12 + 10**7
+    ),
+    LiveCounts(DELIVERY, 18, 15, 0, 2, [(49, 12), (50, 3)], 25.2, 14.2, 1342868, 2),
     Result(DELIVERY, [_FILE], {"points": 76800}),
     Failed(DELIVERY, error_body(SyncError("frames 7, 8 out of step", frames=(7, 8)))),
     Cancel(DELIVERY),
@@ -241,7 +300,31 @@ def vectors() -> list[dict[str, str | Any]]:
             "hex": encode_preview(header, bytes([0, 64, 127, 255])).hex(),
         }
     )
-    to_daemon = (Ready, Ack, Progress, DecodedNote, Result, Failed, Released, Alive, Leaving)
+    live = LiveHeader(
+        number=17,
+        job=LIVE_JOB,
+        content="rows",
+        width=2,
+        height=2,
+        dtype="uint16",
+        scale=75.0,
+        points=3,
+        frame_id=17,
+        start_ns=10**12,
+        end_ns=10**12 + 10**7,
+        sent_ns=10**12 + 34 * 10**6,
+        decode_ms=14.2,
+    )
+    rows = bytes.fromhex("000026007100ff7f")
+    found.append(
+        {
+            "name": "live",
+            "direction": "worker to subscribers",
+            "message": {"header": msgspec.to_builtins(live), "values": {"bytes": rows.hex()}},
+            "hex": encode_live(live, rows).hex(),
+        }
+    )
+    to_daemon = (Ready, Ack, Progress, DecodedNote, LiveCounts, Result, Failed, Released, Alive, Leaving)
     for message in STREAM:
         direction = "worker to daemon" if isinstance(message, to_daemon) else "daemon to worker"
         found.append(_vector(f"worker: {message.__struct_config__.tag}", direction, message))

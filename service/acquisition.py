@@ -72,13 +72,19 @@ class Scan:
             self._opened.measure_latency(self._clock)
         rig = self._opened.rig
         exposure_ns = self._exposure_ns()
-        self._plan: Plan = rig.plan(self._sequence, repeat=params.repeat, exposure_ns=exposure_ns)
+        self._plan: Plan = rig.plan(self._sequence, repeat=self._repeat(), exposure_ns=exposure_ns)
         capabilities = rig.camera.capabilities
         self._format = CameraFormat(capabilities.width, capabilities.height, capabilities.bits, capabilities.mosaic)
         self._frame_bytes = self._format.width * self._format.height * self._format.dtype.itemsize
+        self._say(self._need())
+
+    def _repeat(self) -> int:
+        return self._params.repeat
+
+    def _need(self) -> Need:
         frames = self._plan.frame_count
         results = RESULT_BYTES_PER_PIXEL * self._format.width * self._format.height
-        self._say(Need(self.job, frames, frames * self._frame_bytes + results, self._plan.as_dict()))
+        return Need(self.job, frames, frames * self._frame_bytes + results, self._plan.as_dict())
 
     def run(self, write_backs: WriteBacks) -> None:
         """Take the frames, and say `taken` when the devices are free; `ended` follows when the folder is closed."""
@@ -105,7 +111,7 @@ class Scan:
                 self._say(Began(self.job))
                 outcome = self._acquire(writer, disk, images)
             except ScannerError as error:
-                disk.close("failed", _reason_of(error), (), self._ended_by(error))
+                disk.close("failed", reason_of(error), (), self._ended_by(error))
                 return
             state: State = "complete" if outcome.reason is FinishReason.COMPLETED else "failed"
             disk.close(state, outcome.reason.value, outcome.witnesses.as_list(), self._ended_with(outcome))
@@ -122,7 +128,7 @@ class Scan:
 
     def _ended_by(self, error: ScannerError) -> Callable[[StorageError | None], None]:
         # On a disk that is full the folder cannot be closed: it stays `open`, which says that it was interrupted.
-        return lambda _: self._say(Ended(self.job, _reason_of(error), self._lines, error=error_body(error)))
+        return lambda _: self._say(Ended(self.job, reason_of(error), self._lines, error=error_body(error)))
 
     def refused(self, error: ScannerError | None) -> Ended:
         """The report of a scan that never began."""
@@ -211,7 +217,8 @@ def _check_filters(params: ScanStart) -> None:
         FilterSettings.from_dict(given)
 
 
-def _reason_of(error: ScannerError) -> EndReason | None:
+def reason_of(error: ScannerError) -> EndReason | None:
+    """How a run ends that this error ends; None: it never began."""
     match error:
         case DeviceLost():
             return "device_lost"

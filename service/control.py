@@ -11,7 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from scanner.errors import StorageError
+from scanner.errors import DeviceBusy, StorageError
 from scanner.wire import (
     MAX_FETCH_BYTES,
     MAX_MESSAGE_BYTES,
@@ -20,6 +20,8 @@ from scanner.wire import (
     Fetch,
     Hello,
     JobRef,
+    LiveStart,
+    LiveStop,
     Nothing,
     PreviewStart,
     Refused,
@@ -29,9 +31,9 @@ from scanner.wire import (
 )
 from service.devices_link import DevicesLink
 from service.jobs import Job, JobState
+from service.live import Live
 from service.pipe import Preview
 from service.pipeline import MAX_QUEUED, Pipeline
-from service.spool import CAPTURE
 from service.worker_pool import WorkerPool
 
 MAX_CLIENTS = 4096
@@ -46,6 +48,7 @@ class Endpoints:
     events: str
     preview: str
     worker: str
+    live: str
 
 
 class Control:
@@ -58,6 +61,7 @@ class Control:
         pipeline: Pipeline,
         devices: DevicesLink,
         workers: WorkerPool,
+        live: Live,
         last_event: Callable[[], int],
         stop: Callable[[], None],
     ) -> None:
@@ -66,6 +70,7 @@ class Control:
         self._pipeline = pipeline
         self._devices = devices
         self._workers = workers
+        self._live = live
         self._last_event = last_event
         self._stop = stop
         self._clients: OrderedDict[bytes, str] = OrderedDict()
@@ -80,6 +85,9 @@ class Control:
             "scan.list": self._list,
             "scan.acknowledge": self._acknowledge,
             "scan.delete": self._delete,
+            "live.start": self._live_start,
+            "live.stop": self._live_stop,
+            "live.status": self._live_status,
             "preview.start": self._preview_start,
             "preview.stop": self._preview_stop,
             "shutdown": self._shutdown,
@@ -134,7 +142,7 @@ class Control:
             "endpoints": {
                 "events": self._endpoints.events,
                 "preview": self._endpoints.preview,
-                "live": None,
+                "live": self._endpoints.live,
                 "worker": self._endpoints.worker,
             },
         }
@@ -158,10 +166,14 @@ class Control:
 
     async def _list_devices(self, request: Request, _client: str) -> dict[str, Any]:
         params_as(Nothing, request)
+        self._refuse_while_live()
         return {"devices": await self._devices.discover()}
 
     async def _start(self, request: Request, client: str) -> dict[str, Any]:
-        job = await self._pipeline.submit(params_as(ScanStart, request), client)
+        params = params_as(ScanStart, request)
+        if self._pipeline.store.find(params, client) is None:
+            self._refuse_while_live()
+        job = await self._pipeline.submit(params, client)
         return self._with_number(job)
 
     async def _scan_status(self, request: Request, _client: str) -> dict[str, Any]:
@@ -181,7 +193,7 @@ class Control:
         given = params_as(Fetch, request)
         job = self._pipeline.store.get(given.id)
         entry = next((entry for entry in job.files if entry.name == given.name), None)
-        if entry is None or job.output is None or job.deleted:
+        if entry is None or job.deleted:
             raise Refused(
                 f"job {job.id} has no file {given.name[:200]!r}", reason="unknown_file", hint="scan.result names them"
             )
@@ -194,12 +206,15 @@ class Control:
         self._pipeline.spool.lease(job.id)
         folder = self._pipeline.spool.folder(job.id)
         inside, _, name = entry.name.rpartition("/")
-        path = (folder / CAPTURE if inside == CAPTURE else folder / job.output) / name
+        path = (folder / inside if inside else folder / (job.output or "")) / name
         return await asyncio.to_thread(_piece, path, given.offset, given.length)
 
     async def _cancel(self, request: Request, _client: str) -> dict[str, Any]:
         job = self._job(request)
-        await self._pipeline.cancel(job)
+        if isinstance(job.params, LiveStart):
+            await self._live.stop(job.id)
+        else:
+            await self._pipeline.cancel(job)
         return self._with_number(job)
 
     async def _list(self, request: Request, _client: str) -> dict[str, Any]:
@@ -215,6 +230,22 @@ class Control:
         job = self._job(request)
         await self._pipeline.delete(job)
         return self._with_number(job)
+
+    async def _live_start(self, request: Request, client: str) -> dict[str, Any]:
+        job = await self._live.start(params_as(LiveStart, request), client)
+        return {**self._with_number(job), "endpoint": self._endpoints.live}
+
+    async def _live_stop(self, request: Request, _client: str) -> dict[str, Any]:
+        job = await self._live.stop(params_as(LiveStop, request).id)
+        return self._with_number(job)
+
+    async def _live_status(self, request: Request, _client: str) -> dict[str, Any]:
+        params_as(Nothing, request)
+        return {"number": self._last_event(), "run": self._live.status()}
+
+    def _refuse_while_live(self) -> None:
+        if self._live.running:
+            raise DeviceBusy("the devices are busy with a live run", hint="end it first (live.stop)")
 
     async def _preview_start(self, request: Request, _client: str) -> dict[str, Any]:
         given = params_as(PreviewStart, request)

@@ -42,6 +42,7 @@ from service.control import Control, Endpoints
 from service.devices_link import SILENCE_S as DEVICES_SILENCE_S
 from service.devices_link import DevicesLink
 from service.jobs import JobStore
+from service.live import Live
 from service.logs import start_logging
 from service.pipeline import Pipeline
 from service.sockets import bound, refuse_files, refuse_taken, remove_sockets, send_now
@@ -72,7 +73,9 @@ class Daemon:
     ) -> None:
         self._config = config
         self._state_dir = state_dir
-        self._endpoints = Endpoints(endpoint, *(sibling(endpoint, name) for name in ("events", "preview", "worker")))
+        self._endpoints = Endpoints(
+            endpoint, *(sibling(endpoint, name) for name in ("events", "preview", "worker", "live"))
+        )
         self._devices_silence_s = devices_silence_s
         self._worker_silence_s = worker_silence_s
         self._number = 0
@@ -117,13 +120,14 @@ class Daemon:
         command_line = ("--serve", self._endpoints.worker)
         workers = WorkerPool(router, self.publish, command_line, inherit=[lock], silence_s=self._worker_silence_s)
         pipeline = Pipeline(store, spool, devices, workers, self.publish)
+        live = Live(pipeline, devices, workers, self._endpoints.live)
         control = Control(
-            self._config.rig.name, self._endpoints, pipeline, devices, workers, lambda: self._number, self.stop
+            self._config.rig.name, self._endpoints, pipeline, devices, workers, live, lambda: self._number, self.stop
         )
         serving = [asyncio.create_task(self._listen(control)), asyncio.create_task(self._drain_subscriptions())]
         workers.start(self._config.daemon.workers)
         opening = asyncio.create_task(_open_early(devices))
-        pipeline.start()
+        pipeline.start(live.recover)
         if ready is not None:
             ready.set()
         _log.info("serving %s", self._endpoints.control)
@@ -131,6 +135,7 @@ class Daemon:
             await self._stopped.wait()
         finally:
             _log.info("ending")
+            await live.close()
             await pipeline.close()
             for task in (*serving, opening, *self._calls):
                 task.cancel()

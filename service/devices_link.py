@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from scanner.errors import DeviceBusy, DeviceError, DeviceLost, ProtocolError, ScannerError
-from scanner.wire import ScanStart, error_body, error_from_body
+from scanner.wire import LiveStart, ScanStart, error_body, error_from_body
 from service.children import Child
 from service.pipe import (
     Acquire,
+    AcquireLive,
     Began,
     CancelAcquire,
     Command,
@@ -27,12 +28,15 @@ from service.pipe import (
     Ended,
     Frames,
     Go,
+    Kept,
+    LiveBegan,
     Need,
     Open,
     Opened,
     OpenFailed,
     Preview,
     Report,
+    Shot,
     Taken,
     framed,
     read_report,
@@ -60,6 +64,9 @@ class ScanListener(Protocol):
 
     def frames(self, frames: Frames) -> None:
         """More lines are in frames.jsonl."""
+
+    def live(self, report: LiveBegan | Shot | Kept) -> None:
+        """Of a live run: it began, took a frame, or has more on disk."""
 
 
 class DevicesLink:
@@ -105,15 +112,18 @@ class DevicesLink:
                 hint="unplug and plug the camera, look at the log, and try `fringed devices`",
             ) from None
 
-    async def acquire(self, job: str, folder: Path, params: ScanStart, listener: ScanListener) -> Awaitable[Ended]:
-        """Run a scan until the devices are free again; returns its end, which always comes, to be awaited."""
+    async def acquire(
+        self, job: str, folder: Path, params: ScanStart | LiveStart, listener: ScanListener
+    ) -> Awaitable[Ended]:
+        """Run a scan or a live run until the devices are free; returns its end, which always comes, to be awaited."""
         self._scans[job] = asyncio.Queue()
         try:
             await self.open()
         except ScannerError as error:
             del self._scans[job]
             return _at_once(Ended(job, None, error=error_body(error)))
-        self._send(Acquire(job, str(folder), params))
+        place = str(folder)
+        self._send(AcquireLive(job, place, params) if isinstance(params, LiveStart) else Acquire(job, place, params))
         ended = await self._follow(job, listener)
         if ended is not None:
             del self._scans[job]
@@ -181,6 +191,8 @@ class DevicesLink:
                     listener.began()
                 case Frames():
                     listener.frames(report)
+                case LiveBegan() | Shot() | Kept():
+                    listener.live(report)
 
     async def _next(self, job: str, patience_s: float) -> Report:
         try:
@@ -248,7 +260,7 @@ class DevicesLink:
             case Devices(number=number, devices=devices):
                 if (waiting := self._discoveries.get(number)) is not None and not waiting.done():
                     waiting.set_result(devices)
-            case Need() | Began() | Frames() | Taken() | Ended():
+            case Need() | Began() | Frames() | LiveBegan() | Shot() | Kept() | Taken() | Ended():
                 if (scan := self._scans.get(report.job)) is not None:
                     scan.put_nowait(report)
 

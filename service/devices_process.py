@@ -23,9 +23,11 @@ from scanner.clock import Clock, MonotonicClock
 from scanner.errors import DeviceError, ScannerError
 from scanner.wire import error_body
 from service.acquisition import Scan
+from service.live_acquisition import LiveRun
 from service.logs import start_logging
 from service.pipe import (
     Acquire,
+    AcquireLive,
     CancelAcquire,
     Command,
     DeviceFault,
@@ -102,22 +104,24 @@ class DevicesProcess:
                     self._outbox.post(OpenFailed(error_body(error)))
                     return False
                 self._outbox.post(described(self._opened))
-            case Acquire():
+            case Acquire() | AcquireLive():
                 self._acquire(command)
             case Preview():
                 self._set_preview(command)
             case Discover(number=number):
                 self._outbox.post(Devices(number, _discovered()))
-            case Go() | CancelAcquire():
-                _log.warning("no scan waits for %s", type(command).__name__)
+            case CancelAcquire():
+                _log.debug("cancelled: %s", command.job)  # seen to by the reader, while it ran
+            case Go():
+                _log.warning("no scan waits for its go")
         return True
 
-    def _acquire(self, command: Acquire) -> None:
+    def _acquire(self, command: Acquire | AcquireLive) -> None:
         if self._opened is None:
             raise AssertionError("the daemon opens devices first")
         if self._previewer is not None and self._previewer.rest():
             self._opened.loaded = None
-        scan = Scan(command.job, Path(command.folder), command.params, self._opened, self._clock, self._outbox.post)
+        scan = self._made(command, self._opened)
         with self._lock:
             self._scan = scan
             if command.job in self._cancelled:
@@ -133,6 +137,11 @@ class DevicesProcess:
         finally:
             with self._lock:
                 self._scan = None
+
+    def _made(self, command: Acquire | AcquireLive, opened: OpenRig) -> Scan:
+        if isinstance(command, AcquireLive):
+            return LiveRun(command, opened, self._clock, self._outbox.post)
+        return Scan(command.job, Path(command.folder), command.params, opened, self._clock, self._outbox.post)
 
     def _may_go(self, job: str) -> bool:
         """Wait for the daemon's word, which knows the room in the spool."""

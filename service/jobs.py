@@ -21,7 +21,7 @@ import msgspec
 
 from scanner.errors import ScannerError, StorageError
 from scanner.storage import replace_file, replace_json, storage_errors, sync_folder
-from scanner.wire import TERMINAL_STATES, ErrorBody, FileEntry, Refused, ScanStart, error_body
+from scanner.wire import TERMINAL_STATES, ErrorBody, FileEntry, LiveStart, Refused, ScanStart, error_body
 
 FORMAT = "fringed-job"
 VERSION = 1
@@ -34,6 +34,9 @@ REMEMBER_S = 365 * 86400.0
 
 MAX_DELIVERIES = 3
 """A series that was sent this often without an answer is given up."""
+
+Params = ScanStart | LiveStart
+"""What a job was asked for with: a scan, or a live run."""
 
 _EXPIRED_FILE = "expired.jsonl"
 _log = logging.getLogger(__name__)
@@ -76,7 +79,7 @@ class Job:
 
     id: str
     client: str
-    params: ScanStart
+    params: Params
     state: JobState = JobState.QUEUED
     reason: str | None = None
     """why it ended or its series did: completed, cancelled, worker_lost, ... (formats.md, Wire)"""
@@ -97,6 +100,11 @@ class Job:
     captured: int = 0
     total: int = 0
     stage: str = ""
+
+    @property
+    def kind(self) -> str:
+        """scan or live"""
+        return "live" if isinstance(self.params, LiveStart) else "scan"
 
     @property
     def digest(self) -> str:
@@ -123,6 +131,7 @@ class Job:
         """What `scan.status` and `scan.list` say of it."""
         return {
             "id": self.id,
+            "kind": self.kind,
             "method": self.params.method,
             "state": self.state.value,
             "reason": self.reason,
@@ -156,6 +165,7 @@ class Job:
             "files": [msgspec.to_builtins(entry) for entry in self.files],
             "client": self.client,
             "digest": self.digest,
+            "kind": self.kind,
             "params": msgspec.to_builtins(self.params),
             "created": self.created,
             "ended": self.ended,
@@ -178,7 +188,7 @@ class Job:
         return cls(
             id=str(uuid.UUID(content["id"])),
             client=str(content["client"]),
-            params=msgspec.convert(content["params"], ScanStart),
+            params=_params(content.get("kind", "scan"), content["params"]),
             state=JobState(content["state"]),
             reason=content.get("reason"),
             error=None if error is None else msgspec.convert(error, ErrorBody),
@@ -214,7 +224,7 @@ class JobStore:
     def __iter__(self) -> Iterator[Job]:
         return iter(sorted(self._jobs.values(), key=lambda job: job.created))
 
-    def find(self, params: ScanStart, client: str) -> Job | None:
+    def find(self, params: Params, client: str) -> Job | None:
         """The job that was asked for before, or None.
 
         Raises:
@@ -236,7 +246,7 @@ class JobStore:
             )
         return job
 
-    def make(self, params: ScanStart, client: str) -> Job:
+    def make(self, params: Params, client: str) -> Job:
         """A new job, known from now on. It is the caller's to `write` it before anything is done about it."""
         job = Job(id=canonical_id(params.job_id), client=client, params=params, created=self._now())
         self._jobs[job.id] = job
@@ -320,11 +330,17 @@ def canonical_id(job_id: str) -> str:
         raise Refused(f"job id {job_id[:80]!r} is not a UUID", reason="invalid_params") from None
 
 
-def parameters_digest(params: ScanStart) -> str:
+def parameters_digest(params: Params) -> str:
     """SHA-256 of the parameters without the job id, members sorted, defaults left out."""
     content = msgspec.to_builtins(params)
     content.pop("job_id")
+    if isinstance(params, LiveStart):
+        content["kind"] = "live"  # never the same as a scan with the same words
     return hashlib.sha256(msgspec.msgpack.encode(content, order="sorted")).hexdigest()
+
+
+def _params(kind: str, content: Any) -> Params:
+    return msgspec.convert(content, LiveStart) if kind == "live" else msgspec.convert(content, ScanStart)
 
 
 def _unknown(job_id: str, why: str) -> Refused:

@@ -18,7 +18,7 @@ from msgspec import Struct
 
 from scanner.errors import ProtocolError
 from scanner.stream import EndReason
-from scanner.wire import ErrorBody, ScanStart
+from scanner.wire import ErrorBody, LiveStart, ScanStart
 
 MAX_BYTES = 8 << 20
 
@@ -37,6 +37,14 @@ class Acquire(Struct, frozen=True, tag="acquire"):
     job: str
     folder: str
     params: ScanStart
+
+
+class AcquireLive(Struct, frozen=True, tag="acquire_live"):
+    """The same for a live run; `cancel` ends it. `folder` is for what is retained, or for the ring that is not."""
+
+    job: str
+    folder: str
+    params: LiveStart
 
 
 class Go(Struct, frozen=True, tag="go"):
@@ -106,6 +114,38 @@ class Frames(Struct, frozen=True, tag="frames"):
     retakes: int
 
 
+class LiveBegan(Struct, frozen=True, tag="live_began"):
+    """The pattern is on and frames will follow. `header` is what their capture.json says."""
+
+    job: str
+    header: dict[str, Any]
+    calibration: dict[str, Any] | None
+
+
+class Shot(Struct, frozen=True, tag="shot"):
+    """One frame of a live run. Where there is no time for all, only the newest is sent; `number` shows the gap."""
+
+    job: str
+    number: int
+    path: str
+    offset: int
+    xxh3: str
+    frame_id: int
+    start_ns: int
+    end_ns: int
+    lost: int
+    """frames so far that the camera counted and that never came"""
+
+
+class Kept(Struct, frozen=True, tag="kept"):
+    """A piece of a live recording is on disk and closed, or was let go again by the ring."""
+
+    job: str
+    frames: int
+    """on disk in all"""
+    bytes: int
+
+
 class Taken(Struct, frozen=True, tag="taken"):
     """All frames are taken and the devices are free; the disk is not done yet."""
 
@@ -136,8 +176,8 @@ class DeviceFault(Struct, frozen=True, tag="fault"):
     error: ErrorBody
 
 
-Command = Open | Acquire | Go | CancelAcquire | Preview | Discover
-Report = Opened | OpenFailed | Need | Began | Frames | Taken | Ended | Devices | DeviceFault
+Command = Open | Acquire | AcquireLive | Go | CancelAcquire | Preview | Discover
+Report = Opened | OpenFailed | Need | Began | Frames | LiveBegan | Shot | Kept | Taken | Ended | Devices | DeviceFault
 
 _commands: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)
 _reports: msgspec.msgpack.Decoder[Report] = msgspec.msgpack.Decoder(Report)
@@ -179,7 +219,7 @@ async def read_report(stream: asyncio.StreamReader) -> Report | None:
 class Outbox:
     """What the devices process has to say: `post` never waits, whatever the daemon does.
 
-    A thread writes. Of `Frames` that it has not written yet only the newest is kept.
+    A thread writes. Of `Frames` and of `Shot` that it has not written yet only the newest is kept.
     """
 
     def __init__(self, descriptor: int) -> None:
@@ -193,7 +233,7 @@ class Outbox:
     def post(self, report: Report) -> None:
         """Send a report soon."""
         with self._changed:
-            if isinstance(report, Frames) and self._waiting and isinstance(self._waiting[-1], Frames):
+            if isinstance(report, Frames | Shot) and self._waiting and type(self._waiting[-1]) is type(report):
                 self._waiting.pop()
             self._waiting.append(report)
             self._changed.notify()

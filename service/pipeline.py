@@ -10,18 +10,18 @@ import logging
 import shutil
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import msgspec
 
 from scanner.errors import ConfigError, DeviceError, ScannerError, StorageError, SyncError
-from scanner.stream import DecodedNote, Progress, Result
-from scanner.wire import ErrorBody, Refused, ScanStart, error_from_body
+from scanner.stream import DecodedNote, LiveCounts, Progress, Result
+from scanner.wire import ErrorBody, LiveStart, Refused, ScanStart, error_from_body
 from service.devices_link import DevicesLink
 from service.jobs import Job, JobState, JobStore
-from service.pipe import Ended, Frames, Need
+from service.pipe import Ended, Frames, Kept, LiveBegan, Need, Shot
 from service.series import Series, capture_state, missing_patterns
 from service.spool import Spool, empty_trash
 from service.worker_pool import WorkerLost, WorkerPool
@@ -56,12 +56,12 @@ class Pipeline:
         # One thread: records reach the disk in the order in which they were made.
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="records")
 
-    def start(self) -> None:
-        """Take up what an earlier daemon left, then begin with the queue."""
+    def start(self, recover_live: Callable[[Job], Coroutine[Any, Any, None]]) -> None:
+        """Take up what an earlier daemon left, then begin with the queue. Live runs are `recover_live`'s."""
         for job in self.store.unfinished():
-            self._task(self._recover(job))
-        self._task(self._acquire_all())
-        self._task(self._sweep())
+            self.spawn(recover_live(job) if isinstance(job.params, LiveStart) else self._recover(job))
+        self.spawn(self._acquire_all())
+        self.spawn(self._sweep())
 
     async def close(self) -> None:
         """Cancel the scan that acquires; what is being decoded is taken up by the next daemon."""
@@ -75,6 +75,12 @@ class Pipeline:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         self._disk.shutdown()
+
+    @property
+    def busy_with(self) -> Job | None:
+        """A job that has the devices, or waits for them."""
+        waiting = (job for job in self._queue if job.state is JobState.QUEUED)
+        return self._acquiring or next(waiting, None)
 
     async def submit(self, params: ScanStart, client: str) -> Job:
         """The job of these parameters: the one that is there, or a new one, on disk when this returns.
@@ -90,11 +96,11 @@ class Pipeline:
             raise Refused(f"{MAX_QUEUED} scans wait already", reason="queue_full", hint="ask again later")
         job = self.store.make(params, client)
         try:
-            await self._save(job)
+            await self.save(job)
         except StorageError:
             self.store.forget(job)
             raise
-        self._tell(job, "queued")
+        self.tell(job, "queued")
         if job.state is JobState.QUEUED:
             self._queue.append(job)
             self._queued.set()
@@ -108,13 +114,13 @@ class Pipeline:
             self._devices.cancel(job.id)
         if (series := self._series.get(job.id)) is not None:
             self._workers.cancel(series)
-        await self._end(job, JobState.CANCELLED, reason="cancelled")
+        await self.end(job, JobState.CANCELLED, reason="cancelled")
 
     async def acknowledge(self, job: Job) -> None:
         """Its client has what it needs."""
         if not job.acknowledged:
             job.acknowledged = True
-            await self._save(job)
+            await self.save(job)
 
     async def delete(self, job: Job) -> None:
         """Delete a job's files now.
@@ -125,8 +131,8 @@ class Pipeline:
         """
         if not job.state.over:
             raise Refused(f"job {job.id} is {job.state}", reason="not_over", hint="cancel it first")
-        trash = await self._on_disk(self.spool.remove, job)
-        await self._save(job)
+        trash = await self.on_disk(self.spool.remove, job)
+        await self.save(job)
         await asyncio.to_thread(empty_trash, trash)
         self._publish("spool.deleted", job.id, {})
 
@@ -144,23 +150,21 @@ class Pipeline:
             try:
                 await self._acquire(job)
             except ScannerError as error:
-                await self._end(job, JobState.FAILED, reason="failed", error=error)
+                await self.end(job, JobState.FAILED, reason="failed", error=error)
             except Exception as error:  # noqa: BLE001  (one scan that fails must not end the daemon)
                 _log.exception("job %s", job.id)
-                await self._end(
-                    job, JobState.FAILED, reason="failed", error=ScannerError(f"the daemon failed: {error}")
-                )
+                await self.end(job, JobState.FAILED, reason="failed", error=ScannerError(f"the daemon failed: {error}"))
             finally:
                 self._acquiring = None
 
     async def _acquire(self, job: Job) -> None:
         job.become(JobState.ACQUIRING)
         # Its record has been on disk since it was asked for; what the capture folder says goes before this state.
-        self._task(self._save(job))
-        self._tell(job, "started")
+        self.spawn(self.save(job))
+        self.tell(job, "started")
         folder = self.spool.capture(job.id)
         ending = await self._devices.acquire(job.id, folder, job.params, _Listener(self, job))
-        self._task(self._acquired(job, ending))  # the disk may still be busy with it when the next scan begins
+        self.spawn(self._acquired(job, ending))  # the disk may still be busy with it when the next scan begins
 
     async def _acquired(self, job: Job, ending: Awaitable[Ended]) -> None:
         ended = await ending
@@ -169,18 +173,18 @@ class Pipeline:
             return
         if ended.reason == "completed" and series is not None:
             job.become(JobState.ACQUIRED)
-            await self._save(job)
+            await self.save(job)
             fields = {"reason": ended.reason, "missing": ended.missing, **ended.report}
-            self._tell(job, "acquired", fields)
+            self.tell(job, "acquired", fields)
             series.finish("completed", tuple(ended.missing))
             return
         if series is not None:
             self._workers.cancel(series)
         if ended.reason == "cancelled":
-            await self._end(job, JobState.CANCELLED, reason="cancelled")
+            await self.end(job, JobState.CANCELLED, reason="cancelled")
             return
-        error = _error_of(ended)
-        await self._end(job, JobState.FAILED, reason=ended.reason or _reason_to_fail(error), error=error)
+        error = error_of(ended)
+        await self.end(job, JobState.FAILED, reason=ended.reason or reason_to_fail(error), error=error)
 
     async def room_for(self, job: Job, need: Need) -> None:
         """Make room in the spool for a planned scan.
@@ -189,11 +193,11 @@ class Pipeline:
             StorageError: there is none.
         """
         job.total = need.frames
-        self._tell(job, "plan", {"frames": need.frames, "bytes": need.bytes, "plan": need.plan})
+        self.tell(job, "plan", {"frames": need.frames, "bytes": need.bytes, "plan": need.plan})
         # While the scan before decodes, its room is taken already: files reserved ahead count in full.
-        gone = await self._on_disk(self.spool.make_room, need.bytes, list(self.store))
+        gone = await self.on_disk(self.spool.make_room, need.bytes, list(self.store))
         for deleted in gone:
-            await self._save(deleted)
+            await self.save(deleted)
             self._publish("spool.deleted", deleted.id, {})
 
     def began(self, job: Job) -> None:
@@ -209,7 +213,7 @@ class Pipeline:
         now = time.monotonic()
         if now - told < FRAME_EVENT_S and frames.captured < job.total:
             return told
-        self._tell(job, "retake" if frames.captured == job.total and retakes else "frame", _counts(frames, job.total))
+        self.tell(job, "retake" if frames.captured == job.total and retakes else "frame", _counts(frames, job.total))
         return now
 
     # --- decoding -----------------------------------------------------------------------------------------------
@@ -218,7 +222,7 @@ class Pipeline:
         options = {
             "decoder": job.params.decoder,
             "filters": msgspec.to_builtins(job.params.filters),
-            "compare_truth": job.params.compare_truth,
+            "compare_truth": isinstance(job.params, ScanStart) and job.params.compare_truth,
         }
         return Series(
             job=job.id,
@@ -232,7 +236,7 @@ class Pipeline:
 
     def _follow(self, job: Job, series: Series) -> None:
         self._series[job.id] = series
-        self._task(self._decode(job, series))
+        self.spawn(self._decode(job, series))
         self._workers.submit(series)
 
     async def _decode(self, job: Job, series: Series) -> None:
@@ -244,10 +248,10 @@ class Pipeline:
             if not series.cancelled:
                 raise
         except WorkerLost as lost:
-            await self._end(job, JobState.FAILED, reason="worker_lost", error=lost.error)
+            await self.end(job, JobState.FAILED, reason="worker_lost", error=lost.error)
         except ScannerError as error:
-            reason = "daemon_restarted" if interrupted else _reason_to_fail(error)
-            await self._end(job, JobState.FAILED, reason=reason, error=error)
+            reason = "daemon_restarted" if interrupted else reason_to_fail(error)
+            await self.end(job, JobState.FAILED, reason=reason, error=error)
         finally:
             self._series.pop(job.id, None)
 
@@ -256,21 +260,21 @@ class Pipeline:
             return
         job.files, job.report, job.stage = tuple(result.files), result.report, ""
         reason = job.reason or "completed"
-        await self._end(job, JobState.DONE, reason=reason)
-        await self._on_disk(_remove_other_outputs, series, job.output)
+        await self.end(job, JobState.DONE, reason=reason)
+        await self.on_disk(_remove_other_outputs, series, job.output)
 
-    def _hear(self, job: Job, message: Progress | DecodedNote) -> None:
-        if job.state.over:
+    def _hear(self, job: Job, message: Progress | DecodedNote | LiveCounts) -> None:
+        if job.state.over or isinstance(message, LiveCounts):
             return
         if isinstance(message, Progress):
             job.stage = message.stage
             if job.state is JobState.ACQUIRED:
                 job.become(JobState.DECODING)
-            self._tell(job, "decoding", {"stage": message.stage})
+            self.tell(job, "decoding", {"stage": message.stage})
             return
         job.files, job.report = tuple(message.files), message.report
         job.become(JobState.DECODED)
-        self._tell(job, "decoded", {"report": message.report, "files": msgspec.to_builtins(message.files)})
+        self.tell(job, "decoded", {"report": message.report, "files": msgspec.to_builtins(message.files)})
 
     def _delivering(self, job: Job, number: int) -> None:
         job.deliveries += 1
@@ -278,7 +282,7 @@ class Pipeline:
         job.files = ()
         if job.state in (JobState.DECODING, JobState.DECODED):
             job.become(JobState.ACQUIRED)
-        self._task(self._save(job))
+        self.spawn(self.save(job))
 
     # --- after a restart ----------------------------------------------------------------------------------------
 
@@ -292,27 +296,28 @@ class Pipeline:
                 f"the daemon was restarted while this scan was {was}" + (f" (capture: {reason})" if reason else ""),
                 hint="ask for the scan again with a new job id",
             )
-            await self._end(job, JobState.FAILED, reason="daemon_restarted", error=error)
+            await self.end(job, JobState.FAILED, reason="daemon_restarted", error=error)
             return
         job.state = JobState.ACQUIRED
         if state != "complete":
             job.reason = "daemon_restarted"
         missing = missing_patterns(capture, count)
         job.total, job.captured = count, count - len(missing)
-        await self._save(job)
+        await self.save(job)
         series = self._new_series(job)
         series.finish("completed" if state == "complete" else "daemon_restarted", missing)
-        self._tell(job, "acquired", {"reason": job.reason or "completed", "missing": list(missing)})
+        self.tell(job, "acquired", {"reason": job.reason or "completed", "missing": list(missing)})
         self._follow(job, series)
 
     # --- small things -------------------------------------------------------------------------------------------
 
-    async def _end(self, job: Job, state: JobState, *, reason: str, error: ScannerError | None = None) -> None:
+    async def end(self, job: Job, state: JobState, *, reason: str, error: ScannerError | None = None) -> None:
+        """End a job: its state, on disk, then told. One that is over stays as it is."""
         if job.state.over:
             return
         job.become(state, reason=reason, error=error)
         try:
-            await self._save(job)
+            await self.save(job)
         except StorageError as problem:
             _log.error("job %s is %s, which cannot be recorded: %s", job.id, state, problem)
         fields: dict[str, Any] = {"reason": job.reason}
@@ -320,27 +325,31 @@ class Pipeline:
             fields["files"] = msgspec.to_builtins(job.files)
         if job.error is not None:
             fields["error"] = msgspec.to_builtins(job.error)
-        self._tell(job, state.value, fields)
+        self.tell(job, state.value, fields)
         _log.info("job %s is %s (%s)", job.id, state, job.reason)
 
-    def _tell(self, job: Job, kind: str, fields: Mapping[str, Any] | None = None) -> None:
+    def tell(self, job: Job, kind: str, fields: Mapping[str, Any] | None = None) -> None:
+        """Publish an event of a job."""
         self._publish(kind, job.id, {"state": job.state.value, **(fields or {})})
 
-    async def _save(self, job: Job) -> None:
-        await self._on_disk(self.store.write, job.id, job.record())
+    async def save(self, job: Job) -> None:
+        """Write a job's record."""
+        await self.on_disk(self.store.write, job.id, job.record())
 
-    async def _on_disk(self, function: Callable[..., _T], *arguments: Any) -> _T:
+    async def on_disk(self, function: Callable[..., _T], *arguments: Any) -> _T:
+        """Call in the one thread that changes records and spool."""
         return await asyncio.get_running_loop().run_in_executor(self._disk, function, *arguments)
 
     async def _sweep(self) -> None:
         while True:
-            for job in await self._on_disk(self.spool.sweep, list(self.store)):
-                await self._save(job)
+            for job in await self.on_disk(self.spool.sweep, list(self.store)):
+                await self.save(job)
                 self._publish("spool.deleted", job.id, {})
-            await self._on_disk(self.store.expire, lambda job: not job.deleted and self.spool.folder(job.id).exists())
+            await self.on_disk(self.store.expire, lambda job: not job.deleted and self.spool.folder(job.id).exists())
             await asyncio.sleep(SWEEP_S)
 
-    def _task(self, coroutine: Any) -> None:
+    def spawn(self, coroutine: Any) -> None:
+        """Run beside everything else; ended with the pipeline."""
         task: asyncio.Task[None] = asyncio.create_task(coroutine)
         self._tasks.add(task)
         task.add_done_callback(self._finished)
@@ -368,18 +377,23 @@ class _Listener:
     def frames(self, frames: Frames) -> None:
         self._told = self._pipeline.frames(self._job, frames, self._told)
 
+    def live(self, report: LiveBegan | Shot | Kept) -> None:
+        raise AssertionError(f"a scan says no {type(report).__name__}")
+
 
 def _counts(frames: Frames, total: int) -> dict[str, Any]:
     return {"captured": frames.captured, "total": total, "retakes": frames.retakes}
 
 
-def _error_of(ended: Ended) -> ScannerError:
+def error_of(ended: Ended) -> ScannerError:
+    """Why the devices ended a run."""
     if isinstance(ended.error, ErrorBody):
         return error_from_body(ended.error)
     return ScannerError(f"the scan ended: {ended.reason}")
 
 
-def _reason_to_fail(error: ScannerError) -> str:
+def reason_to_fail(error: ScannerError) -> str:
+    """A word for programs."""
     match error:
         case SyncError():
             return "sync_lost"

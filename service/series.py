@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from scanner.errors import StorageError
-from scanner.stream import DecodedNote, EndReason, Frame, Progress, Result
+from scanner.stream import DecodedNote, EndReason, Frame, LiveCounts, Progress, Result
 
 HEADER = "capture.json"
 RECORDS = "frames.jsonl"
@@ -42,7 +42,7 @@ class Series:
     outputs: Path
     """each delivery writes into a folder of its own in here"""
     options: Mapping[str, Any]
-    told: Callable[[Progress | DecodedNote], None]
+    told: Callable[[Progress | DecodedNote | LiveCounts], None]
     delivering: Callable[[int], None]
     """hears of each delivery before it begins, with its number"""
     deliveries: int = 0

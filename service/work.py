@@ -21,8 +21,23 @@ from numpy.typing import NDArray
 
 from scanner.errors import DecodeError, ScannerError
 from scanner.storage import prepare_output
-from scanner.stream import Ack, Cancel, DecodedNote, End, Failed, Frame, FromWorker, Progress, Released, Result, Start
+from scanner.stream import (
+    Ack,
+    Cancel,
+    DecodedNote,
+    End,
+    Failed,
+    Frame,
+    FromWorker,
+    LiveBegin,
+    LiveFrame,
+    Progress,
+    Released,
+    Result,
+    Start,
+)
 from scanner.wire import FileEntry, error_body
+from service.live_work import LiveWork
 from service.spool import CAPTURE
 from service.warm_up import modules_with_kernels
 
@@ -34,7 +49,7 @@ if TYPE_CHECKING:
 ACK_EVERY = 4
 """Frames between two acknowledgements: a sixteenth of the credit."""
 
-Job = Start | Frame | End | Cancel
+Job = Start | Frame | End | LiveBegin | LiveFrame | Cancel
 _log = logging.getLogger(__name__)
 
 
@@ -52,11 +67,12 @@ class Work:
         self._cancelled: set[int] = set()
         self._ending = threading.Event()
         self._series: _Series | None = None
+        self._live: LiveWork | None = None
 
     @property
     def idle(self) -> bool:
-        """Whether no series is under way."""
-        return self._series is None
+        """Whether no series and no live run is under way."""
+        return self._series is None and self._live is None
 
     def cancel(self, delivery: int | None) -> None:
         """Let a series go (None: everything) at the next stage. Called from another thread."""
@@ -69,11 +85,18 @@ class Work:
         """Work until None comes."""
         if self._decode:
             _warm_up()
+        try:
+            self._serve(jobs)
+        finally:
+            self._end_live()
+
+    def _serve(self, jobs: queue.SimpleQueue[Job | None]) -> None:
         while (message := jobs.get()) is not None:
             try:
                 self._do(message)
             except _Cancelled:
                 self._series = None
+                self._end_live()
                 self._answer(Released(message.delivery))
             except ScannerError as error:
                 self._fail(message.delivery, error)
@@ -82,20 +105,38 @@ class Work:
                 problem = f"the decoder failed: {type(error).__name__}: {error}"
                 self._fail(message.delivery, DecodeError(problem, hint="look at the log for the cause"))
 
+    def _end_live(self) -> None:
+        live, self._live = self._live, None
+        if live is not None:
+            live.close()
+
     def _fail(self, delivery: int, error: ScannerError) -> None:
         self._series = None
+        self._end_live()
         self._answer(Failed(delivery, error_body(error)))
 
     def _do(self, message: Job) -> None:
         if isinstance(message, Cancel):
             # Whatever has become of it: it was stopped in a stage and answered so, is answered for, or never began.
             self._cancelled.discard(message.delivery)
-            if self._series is None or self._series.delivery == message.delivery:
+            under_way = self._live or self._series
+            if under_way is None or under_way.delivery == message.delivery:
                 raise _Cancelled
         elif isinstance(message, Start):
             self._check(message.delivery)
             self._series = _Series(message, self._answer, self._check, decode=self._decode)
             self._series.begin()
+        elif isinstance(message, LiveBegin):
+            self._check(message.delivery)
+            self._live = LiveWork(message, self._answer)
+        elif self._live is not None and self._live.delivery == message.delivery:
+            if isinstance(message, LiveFrame):
+                self._live.frame(message)
+            else:
+                self._end_live()
+                self._answer(Result(message.delivery, []))
+        elif isinstance(message, LiveFrame):
+            return  # of a run that is over
         elif self._series is not None and self._series.delivery == message.delivery:
             self._check(message.delivery)
             if isinstance(message, Frame):

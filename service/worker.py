@@ -34,6 +34,8 @@ from scanner.stream import (
     FromWorker,
     Identify,
     Leaving,
+    LiveBegin,
+    LiveFrame,
     Ready,
     Start,
     Stop,
@@ -46,7 +48,7 @@ from service.work import Work
 _log = logging.getLogger(__name__)
 _encoder = msgspec.msgpack.Encoder()
 
-Job = Start | Frame | End | Cancel
+Job = Start | Frame | End | LiveBegin | LiveFrame | Cancel
 
 
 class Worker:
@@ -138,8 +140,8 @@ class Worker:
                 case Cancel(delivery=delivery):
                     self._work.cancel(delivery)
                     self._jobs.put(message)
-                case Start() | Frame() | End():
-                    if isinstance(message, Start):
+                case Start() | Frame() | End() | LiveBegin() | LiveFrame():
+                    if isinstance(message, Start | LiveBegin):
                         self._delivery = message.delivery
                     self._jobs.put(message)
 

@@ -30,6 +30,7 @@ from scanner.stream import (
     FromWorker,
     Identify,
     Leaving,
+    LiveCounts,
     Progress,
     Ready,
     Released,
@@ -42,6 +43,7 @@ from scanner.stream import (
 from scanner.wire import PROTOCOL, error_from_body
 from service.children import Child
 from service.jobs import MAX_DELIVERIES
+from service.live_series import LiveSeries
 from service.series import RecordTail, Series
 from service.sockets import send_now
 
@@ -60,7 +62,7 @@ class Delivery:
     """One sending of a series to one worker. Its number is never used again."""
 
     number: int
-    series: Series
+    series: Series | LiveSeries
     acked: int = 0
     wake: asyncio.Event = field(default_factory=asyncio.Event)
     sender: asyncio.Task[None] | None = None
@@ -110,7 +112,7 @@ class WorkerPool:
         self._inherit = tuple(inherit)
         self._silence_s = silence_s
         self._seats: dict[bytes, Seat] = {}
-        self._parked: deque[Series] = deque()
+        self._parked: deque[Series | LiveSeries] = deque()
         self._children: dict[int, Child] = {}
         # Numbers of an earlier daemon's deliveries must not come again: a worker of it may still be alive.
         self._numbers = itertools.count(time.time_ns() >> 10)
@@ -124,12 +126,15 @@ class WorkerPool:
         for _ in range(workers):
             self._task(self._keep_worker())
 
-    def submit(self, series: Series) -> None:
-        """Have a series decoded; its `outcome` says when."""
-        self._parked.append(series)
+    def submit(self, series: Series | LiveSeries) -> None:
+        """Have a series decoded; its `outcome` says when. A live run does not wait behind others."""
+        if isinstance(series, LiveSeries):
+            self._parked.appendleft(series)
+        else:
+            self._parked.append(series)
         self._assign()
 
-    def cancel(self, series: Series) -> None:
+    def cancel(self, series: Series | LiveSeries) -> None:
         """Let a series go, wherever it is."""
         series.cancelled = True
         if series in self._parked:
@@ -216,15 +221,12 @@ class WorkerPool:
             _log.warning("job %s: %s; its series is sent again", series.job, why)
             self._parked.appendleft(series)
             return
-        series.outcome.set_exception(
-            WorkerLost(
-                DecodeError(
-                    f"the capture of job {series.job} was given up: sent {series.deliveries} times, and the last {why}",
-                    hint=f"the capture is kept; on the daemon's machine try: fringed decode {series.capture}; "
-                    "look at the log for the cause",
-                )
-            )
-        )
+        what, hint = f"the live run {series.job}", "look at the log for the cause"
+        if isinstance(series, Series):
+            what = f"the capture of job {series.job}"
+            hint = f"the capture is kept; on the daemon's machine try: fringed decode {series.capture}; {hint}"
+        error = DecodeError(f"{what} was given up: sent {series.deliveries} times, and the last {why}", hint=hint)
+        series.outcome.set_exception(WorkerLost(error))
 
     # --- messages from workers ----------------------------------------------------------------------------------
 
@@ -277,7 +279,7 @@ class WorkerPool:
             case Ack(frames=frames):
                 delivery.acked = max(delivery.acked, frames)
                 delivery.wake.set()
-            case Progress() | DecodedNote():
+            case Progress() | DecodedNote() | LiveCounts():
                 delivery.series.told(message)
             case Result() | Failed() | Released():
                 self._over(seat, delivery, message)
@@ -302,16 +304,39 @@ class WorkerPool:
             return
         free = [seat for seat in self._seats.values() if seat.free]
         for seat in free:
-            if not self._parked:
-                return
-            series = self._parked.popleft()
+            series = self._next_for(seat)
+            if series is None:
+                continue
             series.deliveries += 1
             seat.delivery = delivery = Delivery(next(self._numbers), series)
             series.delivering(delivery.number)
-            delivery.sender = self._task(self._send_series(seat, delivery))
+            sending = (
+                self._send_live(seat, delivery, series)
+                if isinstance(series, LiveSeries)
+                else self._send_series(seat, delivery, series)
+            )
+            delivery.sender = self._task(sending)
 
-    async def _send_series(self, seat: Seat, delivery: Delivery) -> None:
-        series = delivery.series
+    def _next_for(self, seat: Seat) -> Series | LiveSeries | None:
+        """Of the series that wait the first that this worker can take: one that decodes nothing takes no live run."""
+        for series in self._parked:
+            if seat.ready.decode or not isinstance(series, LiveSeries):
+                self._parked.remove(series)
+                return series
+        return None
+
+    async def _send_live(self, seat: Seat, delivery: Delivery, series: LiveSeries) -> None:
+        await self._deliver(seat, delivery, series.begin(delivery.number))
+        while True:
+            series.changed.clear()
+            for frame in series.take(delivery.number):
+                self._send(seat, frame)  # one that cannot be sent at once is old by then: the worker sees the gap
+            if series.end is not None:
+                await self._deliver(seat, delivery, End(delivery.number, series.end.reason, 0, []))
+                return
+            await series.changed.wait()
+
+    async def _send_series(self, seat: Seat, delivery: Delivery, series: Series) -> None:
         try:
             tail = RecordTail(series.capture, delivery.number)
         except StorageError as error:

@@ -120,8 +120,15 @@ class CaptureWriter:
         *,
         plan: Mapping[str, Any] | None = None,
         witnesses: Sequence[Mapping[str, Any]] = (),
+        repeat: int | None = None,
     ) -> CaptureHeader:
         """Sync, write the slot count, then capture.json with the final state. Called once.
+
+        Args:
+            state: complete or failed.
+            reason: why it ended.
+            plan, witnesses: in place of the header's.
+            repeat: how many repetitions came, where that was open until now.
 
         Raises:
             StorageError: the disk is full or failed; the folder then stays `open`.
@@ -132,6 +139,7 @@ class CaptureWriter:
             reason=reason,
             plan=self.header.plan if plan is None else plan,
             witnesses=tuple(witnesses) or self.header.witnesses,
+            repeat=repeat or self.header.repeat,
         )
         try:
             with storage_errors(self.folder):

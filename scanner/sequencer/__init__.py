@@ -1,9 +1,10 @@
 """The sequencer: which image when (plan), the run itself, and the proof which frame saw which pattern.
 
-`plan`, `verify` and `witness` are pure; only `acquire`, `measure_latency` and `auto_exposure` touch devices.
+`plan`, `verify` and `witness` are pure; only `acquire`, `endless`, `measure_latency` and `auto_exposure` touch devices.
 """
 
 from scanner.sequencer.audit import CaptureCheck, check_capture
+from scanner.sequencer.endless import EndlessFrame, endless
 from scanner.sequencer.exposure import ExposureChoice
 from scanner.sequencer.exposure import auto as auto_exposure
 from scanner.sequencer.findings import Witness, Witnesses
@@ -18,6 +19,7 @@ from scanner.sequencer.witness import witness
 __all__ = [
     "Acquisition",
     "CaptureCheck",
+    "EndlessFrame",
     "ExposureChoice",
     "FinishReason",
     "FrameSink",
@@ -30,6 +32,7 @@ __all__ = [
     "acquire",
     "auto_exposure",
     "check_capture",
+    "endless",
     "light_unit_ns",
     "measure_latency",
     "plan",

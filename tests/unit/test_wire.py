@@ -25,6 +25,7 @@ READERS: tuple[Callable[[bytes], object], ...] = (
     wire.decode_response,
     wire.decode_event,
     wire.decode_preview,
+    wire.decode_live,
     stream.decode_from_worker,
     stream.decode_to_worker,
 )
@@ -170,6 +171,10 @@ def test_recorded_bytes_mean_what_they_say() -> None:
         if vector["name"] == "preview":
             header, pixels = wire.decode_preview(bytes.fromhex(vector["hex"]))
             assert (header.width * header.height, pixels.hex()) == (4, vector["message"]["pixels"]["bytes"])
+            continue
+        if vector["name"] == "live":
+            live, values = wire.decode_live(bytes.fromhex(vector["hex"]))
+            assert (live.width * live.height, values.hex()) == (4, vector["message"]["values"]["bytes"])
             continue
         found = msgpack.unpackb(bytes.fromhex(vector["hex"]))
         assert wire_vectors._shown(found) == vector["message"], vector["name"]
