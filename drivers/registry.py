@@ -30,6 +30,8 @@ _GROUPS: dict[Kind, str] = {
     "trigger": "fringed.triggers",
 }
 
+_SIMULATORS = "fringed.simulators"
+
 _log = logging.getLogger(__name__)
 
 
@@ -51,6 +53,18 @@ def open_projector(driver: str, device: str, options: Mapping[str, Any], clock: 
 def open_trigger(driver: str, device: str, options: Mapping[str, Any], clock: Clock) -> TriggerBoard:
     """Open a trigger board by its driver's name; see `open_camera`."""
     return cast("TriggerDriver", _load("trigger", driver)).open(device, options, clock)
+
+
+def load_simulator(name: str) -> Any:
+    """What starts simulated devices on a real wire (group `fringed.simulators`); called as `fringed simulate` does.
+
+    Raises:
+        ConfigError: no such simulator.
+    """
+    entries = {entry.name: entry for entry in entry_points(group=_SIMULATORS)}
+    if name not in entries:
+        raise ConfigError(f"no simulator named {name!r}", hint=f"installed: {', '.join(sorted(entries)) or 'none'}")
+    return entries[name].load()
 
 
 def driver_names(kind: Kind) -> list[str]:

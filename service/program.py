@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import typer
 
 from scanner.errors import ScannerError, StorageError
-from service.commands import audit, check_config, daemon, decode, devices, patterns, scan
+from service.commands import audit, check_config, daemon, decode, devices, patterns, scan, simulate
 from service.terminal import error_document, print_error, print_json
 
 FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
@@ -41,6 +41,7 @@ app.command("check-config")(check_config.check_config)
 app.command()(daemon.daemon)
 app.command()(daemon.worker)
 app.command()(daemon.status)
+app.add_typer(simulate.group, name="simulate")
 
 
 def run(words: list[str], *, debug: bool, as_json: bool) -> int:

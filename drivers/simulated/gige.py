@@ -89,6 +89,11 @@ class GigeCamera:
             raise
 
     @property
+    def address(self) -> str:
+        """Where it is found."""
+        return self._wire.address
+
+    @property
     def counts(self) -> StreamCounts:
         """What the stream sent, lost and sent again since power-up."""
         return self._stream.counts

@@ -83,6 +83,8 @@ class ProjectorOptions:
     """frame: a pulse at every refresh, when its light begins; exposure: a pulse when a flip's new image lights up"""
     declare_latency: bool = True
     """false: latency and settle are None in the capabilities, as on an unmeasured rig"""
+    camera_socket: str = ""
+    """path of the socket of a simulated camera in another process, which then sees this projector"""
 
 
 @dataclass(frozen=True)

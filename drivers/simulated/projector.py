@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from drivers.simulated.faults import Allowance, displayed_index
+from drivers.simulated.gige_light import LightRelay
 from drivers.simulated.lines import Recorded, Regular
 from drivers.simulated.options import Settings
 from drivers.simulated.timeline import LoadedImage, Manner
@@ -73,6 +74,13 @@ class SimulatedProjector:
             period_ns=period or 0,
             phase_ns=self._first_vblank_ns,
         )
+        self._relay: LightRelay | None = None
+        if options.camera_socket:
+            try:
+                self._relay = LightRelay(world, options.camera_socket, name)
+            except BaseException:
+                world.release("projector")
+                raise
 
     @property
     def name(self) -> str:
@@ -123,6 +131,8 @@ class SimulatedProjector:
         if self._open:
             self._open = False
             self._world.timeline.show(self._clock.now_ns(), None)
+            if self._relay is not None:
+                self._relay.close()
             self._vsync.end(self._clock.now_ns())
             self._frame_output.end(self._clock.now_ns())
             self._world.release("projector")

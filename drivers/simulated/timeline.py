@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,17 @@ class LoadedImage:
         else:
             self._values = image.copy()
         self._light: tuple[int, float, Light] | None = None
+
+    @classmethod
+    def of(cls, axis: Literal["row", "column"] | None, values: Image) -> LoadedImage:
+        """The image whose `content` is (axis, values)."""
+        found = cls(np.zeros((1, 1), dtype=np.uint8))
+        found._axis, found._values = axis, values
+        return found
+
+    def content(self) -> tuple[Literal["row", "column"] | None, Image]:
+        """The axis along which its values lie, and they; None: all of its pixels."""
+        return self._axis, self._values
 
     def light(self, response: Plane, sigma_px: float, keep: bool = True) -> Light:
         """The image's light for a response (256,) of the projector. keep: for the next time, too."""
@@ -91,6 +102,8 @@ class Timeline:
         """so many so far: who looked ahead sees whether that still holds"""
         self._changes: deque[tuple[float, LoadedImage | None]] = deque([(BEGINNING_NS, None)], maxlen=HISTORY)
         self._lock = threading.Lock()
+        self.told: Callable[[float, LoadedImage | None], None] | None = None
+        """hears of every change, too"""
 
     def show(self, t_ns: int, image: LoadedImage | None) -> None:
         """`image` (None: black) begins to shine at `t_ns`, not before the change before."""
@@ -98,6 +111,8 @@ class Timeline:
             last = self._changes[-1][0]
             self._changes.append((max(float(t_ns), last), image))
             self.changes += 1
+        if self.told is not None:
+            self.told(t_ns, image)
 
     def between(self, start_ns: float, end_ns: float) -> list[Segment]:
         """The images that shine, wholly or while changing, within [start_ns, end_ns]; in order, one at least."""

@@ -1,0 +1,69 @@
+"""`fringed simulate`: simulated devices that stand outside the daemon, on real wires, where any program finds them."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.commands.options import AsJson
+from service.terminal import print_facts, print_json
+
+group = typer.Typer(
+    help="Simulated devices on real wires, for drivers and programs that know nothing of this project.",
+    rich_markup_mode=None,
+    no_args_is_help=True,
+)
+
+
+@group.callback()
+def _group() -> None:
+    pass
+
+
+@group.command("gige")
+def gige(
+    device: Annotated[
+        str, typer.Argument(metavar="RIG/SCENE", help="What it sees, as the simulated camera's device string.")
+    ] = "casey2011/bust",
+    address: Annotated[str, typer.Option(metavar="IP", help="Address of the first camera, 127.x.x.x.")] = "127.0.0.2",
+    count: Annotated[int, typer.Option(min=1, max=64, help="Cameras, at addresses that follow.")] = 1,
+    loss: Annotated[float, typer.Option(min=0.0, max=0.9, help="Share of packets that never arrive.")] = 0.0,
+    queue: Annotated[int, typer.Option(min=0, max=64, help="Triggers remembered while busy; 0: dropped.")] = 0,
+    link: Annotated[float, typer.Option(metavar="MBIT/S", min=0.0, help="Speed of the wire; 0: unlimited.")] = 0.0,
+    ring: Annotated[int, typer.Option(min=0, max=4096, help="Send so many prepared frames in turn: fast.")] = 0,
+    shutter: Annotated[str, typer.Option(help="global or rolling")] = "global",
+    light: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="Socket at which a simulated projector finds the camera.")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the rig's true calibration there.")
+    ] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Put simulated GigE Vision cameras on this machine's loopback network, until interrupted.
+
+    \b
+    Examples:
+      fringed simulate gige
+      fringed simulate gige quick/board --address 127.0.0.5 --loss 0.001
+      fringed simulate gige casey2011/bust --calibration rig.json
+    """
+    from drivers.registry import load_simulator  # noqa: PLC0415
+    from service.logs import start_logging  # noqa: PLC0415
+
+    serve = load_simulator("gige")
+    start_logging("simulate")
+    wire = {"loss": loss, "queue": queue, "link_mbit_s": link}
+    options = {"ring": ring, "shutter": shutter}
+    with serve(device, address=address, count=count, light=light, wire=wire, options=options) as service:
+        if calibration is not None:
+            service.write_calibration(calibration)
+        if as_json:
+            print_json(dict(service.facts))
+        else:
+            print_facts("simulated GigE Vision cameras", list(service.facts))
+        while True:  # until a signal's exception
+            threading.Event().wait(3600.0)
