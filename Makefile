@@ -7,7 +7,7 @@ export PYTHONNOUSERSITE := 1
 bin := .venv/bin
 ARGS ?=
 
-.PHONY: help setup scan test rig check bench docs clean
+.PHONY: help setup scan test rig check bench tables docs clean
 
 help: ## this list
 	@sed -nE 's/^([a-z]+):.*## (.*)/make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
@@ -33,6 +33,9 @@ check: ## format, lint, types, layers
 
 bench: setup ## the benchmarks, one after the other
 	@for bench in bench/*.py; do echo "== $$bench"; $(bin)/python $$bench || exit 1; done
+
+tables: setup ## the dissertation's tables on the simulated rig, into docs/; ARGS="5.1 gamma" makes some
+	@cd bench && ../$(bin)/python -m tables $(ARGS)
 
 docs: setup ## write the generated pages of the documentation anew
 	@$(bin)/python docs/generate.py

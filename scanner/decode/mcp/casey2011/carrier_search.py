@@ -79,7 +79,9 @@ def folded_psd(image: Array, wavelength: float) -> Array:
     return np.asarray(folded, np.float32)
 
 
-def search(folded: Array, expected: NDArray[np.float64], width: int, near: bool = False) -> Search:
+def search(
+    folded: Array, expected: NDArray[np.float64], width: int, near: bool = False, spacing: float | None = None
+) -> Search:
     """Analysis by synthesis (sec. 4.3).
 
     Args:
@@ -89,12 +91,13 @@ def search(folded: Array, expected: NDArray[np.float64], width: int, near: bool 
         near: seek each carrier within half a spacing of where it is expected times the one factor at which all stand
             out best, instead of all between the lowest and the highest: the dissertation's enhancement by prior
             knowledge, for surfaces with a texture of their own.
+        spacing: of the carriers, cycles per px, which bounds the bands' widths; None: the least of `expected`.
     """
     A = cv2.GaussianBlur(folded.sum(axis=0, dtype=np.float64)[None, :], (0, 0), 1.0).ravel()
     D = second_derivative(A)
     B = np.zeros_like(A)
     bins = np.arange(len(A))
-    spacing = float(np.diff(expected).min()) * width
+    spacing = (float(np.diff(expected).min()) if spacing is None else spacing) * width
     low = int(np.ceil((1 - TOLERANCE) * expected[0] * width))
     high = min(int((1 + TOLERANCE) * expected[-1] * width), len(A) - 2)
     found: list[tuple[float, float, float]] = []
