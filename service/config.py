@@ -184,8 +184,9 @@ class CameraSettingsConfig(_Table):
     region: Region | None = Field(
         default=None, description="[x, y, width, height] in sensor pixels, width and height 1 or more"
     )
-    trigger_mode: Literal["software", "free"] | None = Field(
-        default=None, description='"software" or "free" (free run); leave it out to let the planner choose'
+    trigger_mode: Literal["software", "free", "hardware"] | None = Field(
+        default=None,
+        description='"hardware" (trigger line), "software" or "free" (free run); leave it out to let the planner choose',
     )
 
 

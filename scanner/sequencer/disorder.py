@@ -39,8 +39,9 @@ def sync_error(
     suspects: Sequence[int],
     retakes: int = 0,
     hint: str = LIVE_HINT,
+    said: Sequence[str] = (),
 ) -> ScannerError:
-    """The error that names the frames, says what spoke against them, and what to do."""
+    """The error that names the frames, says what spoke against them, and what to do. said: what devices reported."""
     if witnesses.dark:
         return DecodeError("nothing in the camera's view is lit by the projector", hint=DARK_HINT)
     frames = sorted(set(suspects) | set(witnesses.suspects))
@@ -48,7 +49,7 @@ def sync_error(
         frames = list(range(len(sequence)))
     says = [found.says for found in witnesses.items if not found.passed and found.says]
     reasons = [reason for verdict in verdicts if verdict.suspect for reason in verdict.reasons[:1]]
-    detail = "; ".join(dict.fromkeys([*says, *reasons])) or "stamps and content contradict the plan"
+    detail = "; ".join(dict.fromkeys([*said, *says, *reasons])) or "stamps and content contradict the plan"
     named = f"frame{'s' if len(frames) != 1 else ''} {listed(frames)}"
     tried = f" after {retakes} retakes" if retakes else ""
     return SyncError(

@@ -17,10 +17,12 @@ from scanner.devices import (
     ProjectorCapabilities,
     ProjectorKind,
     Source,
+    TriggerCapabilities,
     TriggerMode,
 )
 from scanner.errors import ConfigError
 from scanner.patterns import PatternSequence
+from scanner.sequencer.trigger_plan import TriggerPlan, trigger_plan, trigger_time
 
 DEFAULT_RETAKES = 2
 DEFAULT_MAX_SET_MS = 5000
@@ -39,6 +41,8 @@ class Mode(StrEnum):
     """flip, wait for the light, trigger the camera"""
     FREE = "free"
     """the camera runs by itself; the frame that fits into a pattern's time is taken, the others are dropped"""
+    HARDWARE = "hardware"
+    """a board or the projector pulses the camera's trigger line; the host only flips"""
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,8 @@ class Plan:
     pop_timeout_ns: int
     max_set_ms: int
     retakes: int
+    trigger: TriggerPlan | None = None
+    """mode HARDWARE: how the camera's line is driven"""
     why: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -118,6 +124,7 @@ class Plan:
             "pop_timeout_ns": self.pop_timeout_ns,
             "max_set_ms": self.max_set_ms,
             "retakes": self.retakes,
+            "trigger": None if self.trigger is None else self.trigger.as_dict(),
             "why": dict(self.why),
         }
 
@@ -136,6 +143,7 @@ class Plan:
                 "stamp": Source(content["stamp"]),
                 "latency": _interval(content["latency_ns"]),
                 "settle": _interval(content["settle_ns"]),
+                "trigger": TriggerPlan.from_dict(content.get("trigger")),
                 "why": dict(content.get("why", {})),
             }
         )
@@ -149,6 +157,7 @@ def plan(
     exposure_ns: int | None = None,
     repeat: int = 1,
     trigger_mode: TriggerMode | None = None,
+    board: TriggerCapabilities | None = None,
     latency: Interval | None = None,
     settle: Interval | None = None,
     dwell: int | None = None,
@@ -161,7 +170,8 @@ def plan(
 
     Args:
         exposure_ns: wanted exposure; None = one modulation period (or refresh).
-        trigger_mode: None = software where the camera has it, else free run.
+        trigger_mode: None = hardware where there is a board and the camera can, else software, else free run.
+        board: what the rig's trigger board can do; None = there is none.
         latency, settle: measured on this rig; None = what the projector declares.
         dwell: refreshes a pattern stays on at least; None = as few as its frame needs.
         retakes: rounds of retakes before the run is given up.
@@ -173,7 +183,7 @@ def plan(
     if repeat < 1:
         raise ConfigError(f"repeat must be 1 or more, got {repeat}")
     why: dict[str, str] = {}
-    mode = _mode(projector, camera, sequence, trigger_mode, why)
+    mode = _mode(projector, camera, sequence, trigger_mode, board, why)
     _check_size(projector, sequence)
     latency = latency or projector.latency
     settle = settle or projector.settle
@@ -182,10 +192,17 @@ def plan(
     rolling = camera.readout_ns if camera.shutter == "rolling" else 0
     camera_period = camera.min_period_ns(exposure)
     starts_after = camera.trigger_latency.high_ns if camera.trigger_latency is not None else 0
-    needed = _slot_time(mode, camera, exposure, delay, latency, starts_after)
+    if mode is Mode.HARDWARE:
+        spread = delay - (latency.low_ns if latency is not None else 0)
+        needed = trigger_time(projector, camera, board, exposure_ns=exposure, spread_ns=spread)
+    else:
+        needed = _slot_time(mode, camera, exposure, delay, latency, starts_after)
     least = max(1, -(-needed // projector.refresh_ns))
     held = _dwell(mode, least, dwell, needed, projector, why)
     period = camera_period if mode is Mode.STATIC else held * projector.refresh_ns
+    line = None
+    if mode is Mode.HARDWARE:
+        line = trigger_plan(projector, board, delay_ns=delay, exposure_ns=exposure, period_ns=period, why=why)
     total = delay + period * len(sequence) * repeat
     why["total_ns"] = f"{len(sequence) * repeat} frames of {_ms(period)} each, without retakes"
     # A frame is missing only when it is surely not coming: exposure and transfer, a lost camera slot, and half a second
@@ -211,6 +228,7 @@ def plan(
         pop_timeout_ns=timeout,
         max_set_ms=max_set_ms,
         retakes=retakes,
+        trigger=line,
         why=why,
     )
 
@@ -225,13 +243,9 @@ def _mode(
     camera: CameraCapabilities,
     sequence: PatternSequence,
     asked: TriggerMode | None,
+    board: TriggerCapabilities | None,
     why: dict[str, str],
 ) -> Mode:
-    if asked is TriggerMode.HARDWARE:
-        raise ConfigError(
-            "hardware trigger is not wired into the sequencer yet",
-            hint="leave trigger_mode out, or set it to software or free",
-        )
     if asked is not None and asked not in camera.trigger_modes:
         raise ConfigError(
             f"the camera has no trigger mode {asked.value!r}",
@@ -239,11 +253,11 @@ def _mode(
         )
     if projector.kind is ProjectorKind.SEQUENCER:
         raise ConfigError(
-            "a projector that runs its own table needs hardware trigger, which is not wired into the sequencer yet",
+            "projectors that run a table of their own are not driven by this sequencer yet",
             hint="use it as a plain display (framebuffer) if it has such a mode",
         )
     if len(sequence) == 1:
-        if TriggerMode.FREE in camera.trigger_modes and asked is not TriggerMode.SOFTWARE:
+        if TriggerMode.FREE in camera.trigger_modes and asked in (None, TriggerMode.FREE):
             why["mode"] = "one pattern: it stays on, and the camera runs by itself"
             return Mode.STATIC
     elif projector.kind is ProjectorKind.STATIC:
@@ -251,6 +265,10 @@ def _mode(
             f"a static projector shows one image, the sequence has {len(sequence)}",
             hint="use a one-frame method (mcp) or a projector that can change its image",
         )
+    wired = asked is None and board is not None and TriggerMode.HARDWARE in camera.trigger_modes
+    if wired or asked is TriggerMode.HARDWARE:
+        why["mode"] = "the camera's trigger line is pulsed in step with the display"
+        return Mode.HARDWARE
     if TriggerMode.SOFTWARE in camera.trigger_modes and asked is not TriggerMode.FREE:
         why["mode"] = "the camera takes software triggers: each frame starts when its pattern shines"
         return Mode.SOFTWARE
@@ -259,7 +277,7 @@ def _mode(
         return Mode.FREE
     raise ConfigError(
         "the camera can neither run free nor be triggered by software",
-        hint="hardware trigger is not wired into the sequencer yet",
+        hint="wire its trigger line to a trigger board, and name the board in a table [trigger] of the rig file",
     )
 
 
@@ -341,6 +359,8 @@ def _dwell(
     what = (
         "readout, exposure, one camera period and bounds"
         if mode is Mode.FREE
+        else "the light's change, exposure, the camera's readiness and bounds"
+        if mode is Mode.HARDWARE
         else "light's delay, exposure, readout and bounds"
     )
     if asked is not None and asked < least:

@@ -17,8 +17,9 @@ class Rig:
     """The opened devices and what was measured of them.
 
     `latency` and `settle` are the rig's own measured values and override the projector's; `trigger_mode` None means
-    software trigger where the camera has one, else free run. `mirror` and `rotate` say how the projector hangs: they
-    are applied to each image before it is loaded (mirror first), so that patterns land as described.
+    hardware trigger where there is a board, else software trigger where the camera has one, else free run. `mirror`
+    and `rotate` say how the projector hangs: they are applied to each image before it is loaded (mirror first), so
+    that patterns land as described.
     """
 
     projector: Projector
@@ -40,6 +41,7 @@ class Rig:
             "dwell": self.dwell,
             "exposure_ns": self.settings.exposure_ns,
             "trigger_mode": self.trigger_mode,
+            "board": None if self.trigger is None else self.trigger.capabilities,
         }
         return plan(self.projector.capabilities, self.camera.capabilities, sequence, **{**own, **options})
 

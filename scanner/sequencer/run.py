@@ -21,8 +21,15 @@ from scanner.sequencer.findings import Witnesses
 from scanner.sequencer.plan import Mode, Plan
 from scanner.sequencer.rig import Rig
 from scanner.sequencer.thumbnail import thumbnail
+from scanner.sequencer.triggered import TriggeredRounds
 from scanner.sequencer.verify import FrameVerdict, judge, summary, verify
 from scanner.sequencer.witness import witness
+
+_TRIGGER_MODES = {
+    Mode.FREE: TriggerMode.FREE,
+    Mode.SOFTWARE: TriggerMode.SOFTWARE,
+    Mode.HARDWARE: TriggerMode.HARDWARE,
+}
 
 
 class FrameSink(Protocol):
@@ -186,6 +193,7 @@ class _Run:
         self.plan, self.sequence, self.sink, self.clock = plan, sequence, sink, clock
         self.camera: Camera = rig.camera
         self.projector: Projector = rig.projector
+        self.triggered = TriggeredRounds(plan, rig.projector, rig.camera, rig.trigger, clock)
         self.settings = rig.settings
         self.on_frame, self.cancelled, self.stop_on_overrun = on_frame, cancelled, stop_on_overrun
         self.records: list[FrameRecord] = []
@@ -227,8 +235,7 @@ class _Run:
         expected: int | None = None
         taken = 0
         while taken < self.plan.repeat:
-            if self.cancelled():
-                raise _Ended(FinishReason.CANCELLED)
+            self.go_on()
             frame = self.camera.pop(self.plan.pop_timeout_ns)
             if frame is None:
                 self.missing(taken, flip)
@@ -258,7 +265,7 @@ class _Run:
 
     def whole(self) -> None:
         """Every pattern once, then what is in doubt again, in bounded rounds."""
-        self.camera.start(TriggerMode.SOFTWARE if self.plan.mode is Mode.SOFTWARE else TriggerMode.FREE)
+        self.camera.start(_TRIGGER_MODES[self.plan.mode])
         self.slots(range(self.plan.frame_count))
         for _ in range(self.plan.retakes):
             again = self.doubtful()
@@ -273,15 +280,23 @@ class _Run:
             raise _Ended(FinishReason.SYNC_LOST, self.out_of_step())
 
     def slots(self, patterns: Sequence[int]) -> None:
+        if self.plan.mode is Mode.HARDWARE:
+            black = next(iter(self.sequence.sentinels), 0)
+            for pattern, flip in self.triggered.round(patterns, black, self.take, self.go_on).items():
+                self.missing(pattern, flip)
+            return
         for pattern in patterns:
-            if self.cancelled():
-                raise _Ended(FinishReason.CANCELLED)
+            self.go_on()
             flip = self.projector.show(pattern % self.plan.patterns)
             frame = self.software(flip) if self.plan.mode is Mode.SOFTWARE else self.free(flip)
             if frame is None:
                 self.missing(pattern, flip)
             else:
                 self.take(pattern, flip, frame)
+
+    def go_on(self) -> None:
+        if self.cancelled():
+            raise _Ended(FinishReason.CANCELLED)
 
     def darken(self) -> None:
         """Black for a while, as before the first round: light that comes late must not follow what it should be."""
@@ -382,4 +397,5 @@ class _Run:
 
     def out_of_step(self) -> ScannerError:
         suspects = sorted({v.pattern % self.plan.patterns for v in self.verdicts if v.suspect})
-        return sync_error(self.sequence, self.verdicts, self.witnesses, suspects, self.retakes)
+        said = self.triggered.faults
+        return sync_error(self.sequence, self.verdicts, self.witnesses, suspects, self.retakes, said=said)

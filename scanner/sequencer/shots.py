@@ -67,8 +67,10 @@ class Shots:
         self.projector, self.camera, self.clock = projector, camera, clock
         self.settings = settings or CameraSettings()
         modes = camera.capabilities.trigger_modes
-        self.mode = trigger_mode or (TriggerMode.SOFTWARE if TriggerMode.SOFTWARE in modes else TriggerMode.FREE)
-        if self.mode is TriggerMode.HARDWARE or self.mode not in modes:
+        own = TriggerMode.SOFTWARE if TriggerMode.SOFTWARE in modes else TriggerMode.FREE
+        # A trigger line is for runs: single shots of a rig that has one are taken like those of any other.
+        self.mode = own if trigger_mode in (None, TriggerMode.HARDWARE) else trigger_mode
+        if self.mode not in modes:
             raise ConfigError("test shots need a camera with software trigger or free run", device=camera.name)
         size = projector.capabilities
         black = np.zeros((size.height, size.width), dtype=np.uint8)

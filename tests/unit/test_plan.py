@@ -111,13 +111,13 @@ def test_a_rolling_shutters_readout_is_part_of_every_exposure() -> None:
 @pytest.mark.parametrize(
     ("changes", "options", "says"),
     [
-        ({}, {"trigger_mode": TriggerMode.HARDWARE}, "not wired"),
+        ({}, {"trigger_mode": TriggerMode.HARDWARE}, "no trigger mode"),
         ({}, {"exposure_ns": 900_000_000}, "outside the camera's"),
         ({}, {"exposure_ns": -5}, "positive"),
         ({}, {"exposure_ns": 16_666_667, "dwell": 1}, "too short"),
         ({}, {"repeat": 0}, "repeat"),
         ({"kind": ProjectorKind.STATIC}, {}, "shows one image"),
-        ({"kind": ProjectorKind.SEQUENCER}, {}, "runs its own table"),
+        ({"kind": ProjectorKind.SEQUENCER}, {}, "table of their own"),
         ({"width": 640}, {}, "the projector is 640 x 240"),
     ],
 )

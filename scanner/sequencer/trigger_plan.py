@@ -1,0 +1,124 @@
+"""The part of a plan that a trigger line needs: what the board's table holds, and how far pulses run behind flips.
+
+The board counts vertical blanks, waits out the light's delay and pulses the camera; the host only flips. Where the
+light comes later than the next flip, pulses run whole slots behind the flips. Pure, as `plan` is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from scanner.devices import CameraCapabilities, ProjectorCapabilities, TableSlot, TriggerCapabilities, TriggerSource
+from scanner.errors import ConfigError
+
+GUARD_NS = 100_000
+"""Between a pattern's certain light and the pulse, and before the next edge: a board's clock fit and its events are
+good to tens of microseconds, and a tenth of a millisecond costs nothing at any refresh."""
+
+SPARE_PULSES = 1
+"""Pulses after the last: a flip that is late by a refresh still gets its frame, and a camera that dropped one edge and
+took a false one is found out by the count (one more frame than patterns)."""
+
+
+@dataclass(frozen=True)
+class TriggerPlan:
+    """How the camera's line is driven. Microseconds, as boards take them; 0 and 0 where the projector drives it."""
+
+    line: Literal["board", "projector"]
+    dark_us: int = 0
+    """from the vertical blank that begins a slot to the pulse"""
+    pulse_us: int = 0
+    lead: int = 0
+    """slots by which pulses run behind flips: the first `lead` pulses see what shone before"""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for capture.json."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any] | None) -> TriggerPlan | None:
+        """Read what `as_dict` wrote; None for captures without a trigger line.
+
+        Raises:
+            TypeError: it is something else.
+        """
+        return None if content is None else cls(**content)
+
+    def table(self, patterns: int, dwell: int) -> list[TableSlot]:
+        """The board's table for so many patterns, source VSYNC: every `dwell` vertical blanks one pulse."""
+        count = patterns + self.lead + SPARE_PULSES
+        return [
+            TableSlot(image=i, exposure_us=self.pulse_us, dark_us=self.dark_us, wait_trigger=True, edges=dwell)
+            for i in range(count)
+        ]
+
+
+def trigger_time(
+    projector: ProjectorCapabilities,
+    camera: CameraCapabilities,
+    board: TriggerCapabilities | None,
+    *,
+    exposure_ns: int,
+    spread_ns: int,
+) -> int:
+    """Least time of a slot, ns.
+
+    Light changes over `spread_ns` (from the least latency to certain light); within the rest the exposure must lie,
+    and the camera must be ready again. A projector's own pulse comes when light begins, so the next one counts.
+    """
+    rolling = camera.readout_ns if camera.shutter == "rolling" else 0
+    late = camera.line_latency.high_ns if camera.line_latency is not None else 2 * camera.stamp_bound_ns
+    wait = 2 * GUARD_NS + 1000 * board.dark_min_us if board is not None else projector.refresh_ns
+    return max(spread_ns + wait + late + exposure_ns + rolling, camera.min_period_ns(exposure_ns) + GUARD_NS)
+
+
+def trigger_plan(
+    projector: ProjectorCapabilities,
+    board: TriggerCapabilities | None,
+    *,
+    delay_ns: int,
+    exposure_ns: int,
+    period_ns: int,
+    why: dict[str, str],
+) -> TriggerPlan:
+    """The table of a board, or the projector's own output.
+
+    Args:
+        board: the rig's board, None without one.
+        delay_ns: from a flip to its certain light.
+        period_ns: time of a slot, at least what `trigger_time` gave.
+        why: gets the reason.
+
+    Raises:
+        ConfigError: there is nothing that could pulse the line.
+    """
+    if board is None:
+        if "frame" not in projector.trigger_outputs:
+            raise ConfigError(
+                "hardware trigger needs a trigger board, or a projector with a trigger output at every refresh",
+                hint="name the board in a table [trigger] of the rig file, or set trigger_mode to software",
+            )
+        why["trigger"] = "the projector's output pulses at every refresh; the frame that fits its pattern is taken"
+        return TriggerPlan("projector")
+    if TriggerSource.VSYNC not in board.sources:
+        raise ConfigError(
+            "the trigger board has no vertical-sync input, and a board that runs by itself drifts out of step",
+            hint="wire the display's vertical sync to the board, or set trigger_mode to software",
+        )
+    wanted = delay_ns + GUARD_NS
+    lead, dark = divmod(wanted, period_ns)
+    room = period_ns - GUARD_NS - 1000 * board.exposure_min_us
+    if dark > room:
+        lead, dark = lead + 1, 0
+    dark_us = max(board.dark_min_us, -(-dark // 1000))
+    pulse_us = max(board.exposure_min_us, min(exposure_ns, period_ns - GUARD_NS - 1000 * dark_us) // 1000)
+    if max(dark_us, pulse_us) > board.time_max_us:
+        raise ConfigError(f"a slot of {period_ns / 1e6:.3g} ms is longer than the trigger board can time")
+    why["trigger"] = (
+        f"the board pulses {dark_us / 1e3:.3g} ms after a vertical blank"
+        + (f", {lead} slots behind the flips" if lead else "")
+        + f": light is certain {delay_ns / 1e6:.3g} ms after its flip"
+    )
+    return TriggerPlan("board", int(dark_us), int(pulse_us), int(lead))

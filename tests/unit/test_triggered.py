@@ -1,0 +1,271 @@
+"""Runs whose camera is fired through its trigger line: at the display's full rate, in step, whatever goes wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from drivers.registry import open_camera, open_projector, open_trigger
+from drivers.simulated.trigger_board import CAPABILITIES as BOARD
+from scanner.clock import VirtualClock
+from scanner.devices import (
+    CameraCapabilities,
+    CameraFrame,
+    Exposure,
+    Flip,
+    Interval,
+    ProjectorCapabilities,
+    ProjectorKind,
+    Source,
+    TriggerEvent,
+    TriggerMode,
+    TriggerSource,
+)
+from scanner.errors import ConfigError, DeviceLost, SyncError
+from scanner.patterns import CameraFormat, McpPattern, PatternSequence
+from scanner.sequencer import Plan, Rig, acquire
+from scanner.sequencer.plan import Mode, plan
+from scanner.sequencer.triggered import Pairing
+from tests.unit.sequencer_bench import QUICK, MemorySink, Taken, pmp
+
+MS = 1_000_000
+REFRESH = 16_666_667
+PROJECTOR = ProjectorCapabilities(
+    ProjectorKind.FRAMEBUFFER, 320, 240, REFRESH, latency=Interval(4 * MS, 5 * MS), settle=Interval(0, MS // 2)
+)
+CAMERA = CameraCapabilities(
+    320,
+    240,
+    8,
+    "global",
+    5 * MS,
+    10_000,
+    1000 * MS,
+    1000,
+    1 * MS,
+    frozenset(TriggerMode),
+    line_latency=Interval(5_000, 15_000),
+)
+SEQUENCE = pmp()
+
+
+def planned(sequence: PatternSequence = SEQUENCE, **changes: Any) -> Plan:
+    return plan(PROJECTOR, CAMERA, sequence, **{"exposure_ns": 8 * MS, "board": BOARD, **changes})
+
+
+# --- the plan -----------------------------------------------------------------------------------------------------
+
+
+def test_a_board_makes_every_refresh_a_pattern() -> None:
+    made = planned()
+    assert made.mode is Mode.HARDWARE
+    assert made.dwell == 1
+    assert made.trigger is not None
+    assert (made.trigger.line, made.trigger.lead) == ("board", 0)
+    assert made.trigger.dark_us == 5_600
+    assert made.trigger.dark_us + made.trigger.pulse_us < REFRESH / 1000
+    assert "after a vertical blank" in made.why["trigger"]
+    assert Plan.from_dict(made.as_dict()) == made
+
+
+def test_light_that_comes_after_the_next_flip_puts_pulses_slots_behind() -> None:
+    made = planned(latency=Interval(39 * MS, 40 * MS))
+    assert made.dwell == 1
+    assert made.trigger is not None
+    assert made.trigger.lead == 2
+    assert made.trigger.dark_us == -(-(40_600_000 - 2 * REFRESH) // 1000)
+
+
+def test_a_long_exposure_takes_more_refreshes() -> None:
+    made = planned(exposure_ns=20 * MS)
+    assert made.dwell == 2
+    assert made.trigger is not None
+    assert {slot.edges for slot in made.trigger.table(4, made.dwell)} == {2}
+    assert len(made.trigger.table(4, made.dwell)) == 5
+
+
+def test_a_camera_that_is_not_ready_in_time_gets_it() -> None:
+    slow = replace(CAMERA, min_gap_ns=12 * MS)
+    assert plan(PROJECTOR, slow, SEQUENCE, exposure_ns=8 * MS, board=BOARD).dwell == 2
+
+
+def test_what_cannot_pulse_the_line_is_refused() -> None:
+    with pytest.raises(ConfigError, match="needs a trigger board"):
+        planned(board=None, trigger_mode=TriggerMode.HARDWARE)
+    with pytest.raises(ConfigError, match="vertical-sync"):
+        planned(board=replace(BOARD, sources=frozenset({TriggerSource.INTERNAL})))
+    untriggered = replace(CAMERA, trigger_modes=frozenset({TriggerMode.FREE}))
+    with pytest.raises(ConfigError, match="no trigger mode"):
+        plan(PROJECTOR, untriggered, SEQUENCE, board=BOARD, trigger_mode=TriggerMode.HARDWARE)
+
+
+def test_what_is_asked_for_goes_before_the_board() -> None:
+    assert planned(trigger_mode=TriggerMode.SOFTWARE).mode is Mode.SOFTWARE
+    assert planned(trigger_mode=TriggerMode.FREE).mode is Mode.FREE
+    one = PatternSequence(QUICK, McpPattern())
+    assert planned(one).mode is Mode.STATIC
+
+
+# --- pairing ------------------------------------------------------------------------------------------------------
+
+
+def frame(start_ns: int, trigger: int | None = None, source: Source = Source.HARDWARE) -> CameraFrame:
+    return CameraFrame(None, 0, Exposure(start_ns, start_ns + 8 * MS, MS, source), trigger=trigger)  # type: ignore[arg-type]
+
+
+def paired(shown: int = 4) -> tuple[Pairing, list[TriggerEvent]]:
+    """A pairing with flips at every refresh, and the events of a board that pulses 5.6 ms after each."""
+    pairing = Pairing(planned(), CAMERA.line_latency, with_board=True)
+    for i in range(shown):
+        pairing.flipped(i, Flip(i * REFRESH, i, 0, Source.HARDWARE))
+    return pairing, [TriggerEvent(0, i, i * REFRESH + 5_600_000, 2_000, Source.HARDWARE) for i in range(shown)]
+
+
+def test_a_frame_belongs_to_what_shone_and_has_its_pulses_stamp() -> None:
+    pairing, events = paired()
+    found = pairing.pair(frame(2 * REFRESH + 5_900_000, trigger=2), events)
+    assert found is not None
+    pattern, flip, stamped = found
+    assert (pattern, flip.vblank) == (2, 2)
+    assert stamped.exposure == Exposure(2 * REFRESH + 5_610_000, 2 * REFRESH + 13_610_000, 7_000, Source.HARDWARE)
+    assert list(pairing.without_frame()) == [0, 1, 3]
+
+
+def test_a_second_frame_and_one_from_before_are_left() -> None:
+    pairing, events = paired()
+    assert pairing.pair(frame(-5 * MS), events) is None
+    assert pairing.pair(frame(5_600_000), events) is not None
+    assert pairing.pair(frame(7 * MS), events) is None
+
+
+def test_counts_that_disagree_are_told_and_time_decides() -> None:
+    pairing, events = paired()
+    first = pairing.pair(frame(5_600_000, trigger=7), events)
+    assert first is not None
+    assert first[0] == 0
+    later = pairing.pair(frame(REFRESH + 5_600_000, trigger=9), events)
+    assert later is not None
+    assert later[0] == 1
+    assert pairing.uncounted == 1
+
+
+def test_a_believed_stamp_without_a_count_stays_a_belief() -> None:
+    pairing, events = paired()
+    found = pairing.pair(frame(5_600_000, source=Source.ESTIMATED), events)
+    assert found is not None
+    assert found[2].exposure.source is Source.ESTIMATED
+    counted = pairing.pair(frame(REFRESH + 5_600_000, trigger=1, source=Source.ESTIMATED), events)
+    assert counted is not None
+    assert counted[2].exposure.source is Source.HARDWARE
+
+
+# --- runs ---------------------------------------------------------------------------------------------------------
+
+
+def take(faults: str = "", sequence: PatternSequence = SEQUENCE, board: bool = True, **options: Any) -> Taken:
+    device = "quick/board?seed=1&min_gap_us=1000" + (f"&{faults}" if faults else "")
+    clock = VirtualClock()
+    projector, camera = open_projector("simulated", device, {}, clock), open_camera("simulated", device, {}, clock)
+    trigger = open_trigger("simulated", device, {}, clock) if board else None
+    try:
+        rig = Rig(projector, camera, trigger, trigger_mode=TriggerMode.HARDWARE)
+        sink = MemorySink()
+        made = rig.plan(sequence, **{"exposure_ns": 12_500_001, **options})
+        acquisition = acquire(rig, made, sequence, sink, clock)
+        seen = camera.capabilities
+        truth = camera.truth()  # type: ignore[attr-defined]
+        return Taken(acquisition, sequence, sink, truth, CameraFormat(seen.width, seen.height, seen.bits))
+    finally:
+        camera.close()
+        projector.close()
+        if trigger is not None:
+            trigger.close()
+
+
+def test_a_sequence_takes_as_many_refreshes_as_it_has_images() -> None:
+    """12.5 ms exposures at 60 Hz: nothing but the light's latency is added."""
+    taken = take()
+    first, last = taken.acquisition.records[0], taken.acquisition.records[-1]
+    assert taken.acquisition.error is None
+    assert taken.acquisition.retakes == 0
+    assert first.flip is not None
+    assert last.exposure is not None
+    assert last.exposure.end_ns - first.flip.t_ns <= len(SEQUENCE) * REFRESH + 4 * MS
+    assert {verdict.verdict for verdict in taken.acquisition.verdicts} == {"proved"}
+    assert taken.error_px().max() < 1
+
+
+@pytest.mark.parametrize("latency_us", [0, 9_000, 16_000, 40_000])
+def test_any_latency_is_followed(latency_us: int) -> None:
+    taken = take(f"latency_us={latency_us}&latency_spread_us=100")
+    assert taken.acquisition.error is None
+    assert taken.acquisition.retakes == 0
+    assert taken.acquisition.plan.dwell == 1
+    assert {verdict.verdict for verdict in taken.acquisition.verdicts} == {"proved"}
+
+
+def test_an_unmeasured_latency_is_waited_for_and_proves_nothing() -> None:
+    taken = take("declare_latency=false")
+    assert taken.acquisition.error is None
+    assert {verdict.verdict for verdict in taken.acquisition.verdicts} == {"consistent"}
+    assert taken.error_px().max() < 1
+
+
+def test_a_projectors_own_output_fires_the_camera() -> None:
+    taken = take("trigger_outputs=frame&line=frame", board=False)
+    assert taken.acquisition.error is None
+    assert taken.acquisition.plan.trigger is not None
+    assert taken.acquisition.plan.trigger.line == "projector"
+    assert taken.error_px().max() < 1
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        "drop_pulses=4",
+        "spurious=4",
+        "spurious=4&drop_pulses=9",
+        "counts_triggers=false&drop_pulses=4",
+        "latch=true&spurious=4",
+        "drop=6&times=1",
+        "double=6&times=1",
+        "skip=5&times=1",
+        "late_flips=1&times=1",
+        "lose_events=3",
+        "source_ends_after=12",
+        "stamp_lie_ns=-9000000",
+        "stamp_lie_ns=-9000000&counts_triggers=false",
+        "swap=5",
+        "order=rotate:3,8",
+        "order=reverse",
+        "late_flips=1",
+    ],
+)
+def test_faults_end_in_a_right_cloud_or_in_an_error_that_names_frames(faults: str) -> None:
+    taken = take(faults)
+    if taken.acquisition.error is None:
+        assert taken.error_px().max() < 1
+    else:
+        assert isinstance(taken.acquisition.error, SyncError)
+        assert taken.acquisition.error.frames
+
+
+@pytest.mark.parametrize("faults", ["drop_pulses=4", "spurious=4", "drop=6&times=1", "source_ends_after=12"])
+def test_single_faults_of_the_line_cost_retakes_not_the_scan(faults: str) -> None:
+    taken = take(faults)
+    assert taken.acquisition.error is None
+    assert 0 < taken.acquisition.retakes < len(SEQUENCE)
+
+
+def test_a_board_that_hears_no_vertical_blank_is_named() -> None:
+    taken = take("source_ends_after=0")
+    assert isinstance(taken.acquisition.error, SyncError)
+    assert "no VSYNC edge" in str(taken.acquisition.error)
+
+
+def test_a_board_that_goes_away_is_a_lost_device() -> None:
+    taken = take("trigger.unplug_after=4")
+    assert isinstance(taken.acquisition.error, DeviceLost)
+    assert taken.acquisition.reason.value == "device_lost"
