@@ -30,9 +30,8 @@ def test_every_table_has_its_page_and_the_index_lists_it(tables: ModuleType) -> 
         assert text.startswith(f"# {title}\n"), name
         assert f'make tables ARGS="{argument}"' in text
         assert "## Where it differs, and why\n\n" in text
-        assert (
-            "| published |" in text or "(published)" in text or "eq. 3" in title or "eq. 5" in title or "Req" in title
-        )
+        if name.startswith("table-"):
+            assert "| published |" in text or "(published)" in text
 
 
 def test_a_table_that_is_not_there_is_wrong_usage(
@@ -86,7 +85,7 @@ def test_runs_are_counted_row_by_row(tables: ModuleType) -> None:
 
 def test_points_of_the_spheres_middle_alone_are_its_surface(tables: ModuleType) -> None:
     centre = tables.depth.SPHERE_CENTRE_MM
-    front, edge, board = centre - [0, 0, 80], centre + [0, 79.9, -4.0], np.array([0.0, 0, 1346])
+    front, edge, board = centre - np.array([0, 0, 80]), centre + np.array([0, 79.9, -4]), np.array([0.0, 0, 1346])
     assert tables.depth._on_surface(np.array([front, edge, board])).tolist() == [True, False, False]
     figures = tables.depth._figures(
         np.array([[3.0, 0, 4], [math.nan, 0, 0], [3, 0, -4]]), np.array([True, True, False])
