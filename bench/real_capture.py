@@ -3,10 +3,11 @@
     python bench/real_capture.py [FOLDER] [--gray capture-gray.json]
 
 Without FOLDER it is the skull of `$FRINGED_REAL_DATA`, or of shared/data beside the clone; where there is none, nothing
-is measured, and it says so. FOLDER holds capture.json, calibration.json and reference.npz (`rows` or `columns`: somebody's plain decode, NaN
-where it has none). Everything runs through `scanner.reconstruct`, filters and all, as `fringed decode` does. Depth is
-told on the reference's pixels before and after our filters, and over all our points: a decoder that reaches deeper
-into the shade than the reference has a wider range without being wrong, which the Gray code shows.
+is measured, and it says so. FOLDER holds capture.json, calibration.json and reference.npz (`rows` or `columns`:
+somebody's plain decode, NaN where it has none). Everything runs through `scanner.reconstruct`, filters and all, as
+`fringed decode` does. Depth is told on the reference's pixels before and after our filters, and over all our points: a
+decoder that reaches deeper into the shade than the reference has a wider range without being wrong, which the Gray
+code shows.
 """
 
 from __future__ import annotations
