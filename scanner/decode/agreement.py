@@ -139,20 +139,23 @@ def _remainder(
 ) -> Remainder:
     if remainder.size < MIN_PIXELS:
         return Remainder(float(low), float(high), 0.0, least, 0.0, 0.0, int(remainder.size))
-    bins = np.array_split(np.argsort(variance), _NOISE_BINS)
-    x = np.array([np.median(variance[b]) for b in bins])
-    y = np.array([_sigma_of_median(float(np.median(np.abs(remainder[b])))) ** 2 for b in bins])
+    order = np.argsort(variance)[: remainder.size // _NOISE_BINS * _NOISE_BINS].reshape(_NOISE_BINS, -1)
+    middle = order.shape[1] // 2
+    x = variance[order[:, middle]]
+    medians = np.partition(np.abs(remainder)[order], middle, axis=1)[:, middle]
+    y = np.array([_sigma_of_median(float(median)) ** 2 for median in medians])
     # Weights 1 / y: a variance's own error grows with it.
     rest = max(float(np.average(y - x, weights=1 / np.maximum(y, 1e-12))), 0.0)
-    better = np.concatenate(bins[: _NOISE_BINS // 2])
-    vector = np.exp(2j * np.pi * remainder[better]).mean()
+    better = order[: _NOISE_BINS // 2].reshape(-1)
+    turns = remainder[better].astype(np.float32) * np.float32(2 * np.pi)
+    cosine, sine = float(np.cos(turns).mean()), float(np.sin(turns).mean())
     return Remainder(
         float(low),
         float(high),
-        float(np.sqrt(np.median(variance[better]))),
+        float(np.sqrt(variance[better[better.size // 2]])),
         max(float(np.sqrt(rest / weight)), least),
-        float(np.angle(vector) / (2 * np.pi)),
-        float(np.abs(vector)),
+        float(np.arctan2(sine, cosine) / (2 * np.pi)),
+        float(np.hypot(cosine, sine)),
         int(remainder.size),
     )
 

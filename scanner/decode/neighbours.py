@@ -63,24 +63,37 @@ def _settle(
 ) -> int:
     height, width = reason.shape
     settled = 0
+    at_risk = np.zeros(height, np.bool_)
     for y in range(height):
-        for x in range(width):
-            if reason[y, x] == _RISK:
-                agreed, order = _order_of_neighbours(position, reason, y, x, cycles_per_px)
-                if agreed:
-                    # Not yet a value: it has no say about others.
-                    reason[y, x] = _SETTLED
-                    position[y, x] += order / cycles_per_px
-                    settled += 1
+        at_risk[y] = _any_at_risk(reason[y])
+        if at_risk[y]:
+            for x in range(width):
+                if reason[y, x] == _RISK:
+                    agreed, order = _order_of_neighbours(position, reason, y, x, cycles_per_px)
+                    if agreed:
+                        # Not yet a value: it has no say about others.
+                        reason[y, x] = _SETTLED
+                        position[y, x] += order / cycles_per_px
+                        settled += 1
     for y in range(height):
-        for x in range(width):
-            if reason[y, x] == _SETTLED:
-                reason[y, x] = _VALUE
-                confidence[y, x] = settled_confidence
-            elif reason[y, x] == _RISK:
-                position[y, x] = np.float32(np.nan)
-                sigma[y, x] = np.float32(np.nan)
+        if at_risk[y]:
+            for x in range(width):
+                if reason[y, x] == _SETTLED:
+                    reason[y, x] = _VALUE
+                    confidence[y, x] = settled_confidence
+                elif reason[y, x] == _RISK:
+                    position[y, x] = np.float32(np.nan)
+                    sigma[y, x] = np.float32(np.nan)
     return settled
+
+
+@kernel
+def _any_at_risk(reason: NDArray[np.uint8]) -> bool:
+    # Without a way out of the loop: sixty-four pixels at once are faster than one and then none.
+    found = np.uint8(0)
+    for x in range(reason.size):
+        found |= np.uint8(reason[x] == _RISK)
+    return bool(found)
 
 
 @kernel

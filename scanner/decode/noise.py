@@ -54,15 +54,26 @@ def fit_noise(level: NDArray[np.float32], squares: NDArray[np.float32], freedom:
     """
     if freedom < 1 or level.size < 100:
         return default_noise(max_value)
-    bins = np.array_split(np.argsort(level), _LEVELS)
-    x = np.array([np.median(level[b]) for b in bins], dtype=np.float64)
-    y = np.array([np.median(squares[b]) for b in bins], dtype=np.float64) / (freedom * (1 - 2 / (9 * freedom)) ** 3)
+    # As many in each bin: up to eleven of the brightest are left out.
+    order = np.argsort(level)[: level.size // _LEVELS * _LEVELS].reshape(_LEVELS, -1)
+    middle = order.shape[1] // 2
+    x = level[order[:, middle]].astype(np.float64)
+    y = np.partition(squares[order], middle, axis=1)[:, middle].astype(np.float64)
+    y /= freedom * (1 - 2 / (9 * freedom)) ** 3
     # A variance's own error grows with it: weights 1 / y, one round of which is enough for two parameters.
     w = 1 / np.maximum(y, ROUNDING_VARIANCE)
-    slope, read = np.polyfit(x, y, 1, w=w) if np.ptp(x) > 1 else (0.0, float(np.median(y)))
+    slope, read = _line(x, y, w * w) if np.ptp(x) > 1 else (0.0, float(np.median(y)))
     if slope < 0:
         slope, read = 0.0, float(np.average(y, weights=w))
     elif read < ROUNDING_VARIANCE:
         read = ROUNDING_VARIANCE
         slope = max(float(np.sum(w**2 * x * (y - read)) / max(np.sum(w**2 * x * x), 1e-12)), 0.0)
     return NoiseModel(max(float(read), ROUNDING_VARIANCE), float(slope), measured=True)
+
+
+def _line(x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]) -> tuple[float, float]:
+    """Slope and value at 0 of the line with the least weighted squares."""
+    total = weight.sum()
+    x0, y0 = (weight @ x) / total, (weight @ y) / total
+    slope = (weight * (x - x0)) @ y / ((weight * (x - x0)) @ (x - x0))
+    return float(slope), float(y0 - slope * x0)

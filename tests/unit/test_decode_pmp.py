@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import pytest
 from scanner.decode import Reason, decoder_for
 from scanner.decode.neighbours import CONFIDENCE, settle
 from scanner.decode.pmp import PmpDecoder, PmpThresholds, warm_up
+from scanner.decode.pmp_axis import in_strips
+from scanner.decode.pmp_kernels import ARCTAN_ERROR_CYCLES, TILE, _phase
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, PmpPattern, ProjectorSize
 
@@ -419,3 +422,61 @@ def test_thresholds_can_be_chosen_and_are_reported():
 
 def test_kernels_compile_before_they_are_needed():
     warm_up()
+
+
+# --- one pass over all frames -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axes", [("y",), ("x", "y")])
+@pytest.mark.parametrize("size", [(200, 150), (331, 97), (7, 5), (1, 1)])
+def test_threads_and_borrowed_frames_make_no_difference(axes, size):
+    camera = CameraFormat(*size)
+    pattern = PmpPattern(axes, (1.0, 8.0, 40.0), (3, 5, 8))
+    frames = render(pattern, camera, noise=1.0)
+    sequence = PatternSequence(PROJECTOR, pattern)
+    one, three = PmpDecoder(sequence, camera, threads=1), PmpDecoder(sequence, camera, threads=3)
+    for position, frame in enumerate(frames):
+        one.add(position, frame)
+        three.keep(position, np.asfortranarray(frame) if position % 2 else frame)
+    expected, found = one.finish(), three.finish()
+    for name in ("rows", "sigma_rows", "columns", "confidence", "albedo", "modulation", "reason"):
+        a, b = getattr(expected, name), getattr(found, name)
+        assert (a is None and b is None) or np.array_equal(a, b, equal_nan=True)
+    assert expected.details == found.details
+    assert sum(expected.details["counts"].values()) == camera.width * camera.height
+
+
+def test_strips_cover_every_pixel_once():
+    for pixels, threads in ((1, 2), (TILE + 1, 2), (10 * TILE - 3, 3), (100_000, 1)):
+        strips = sorted(in_strips(lambda begin, end: (begin, end), pixels, threads))
+        assert strips[0][0] == 0
+        assert strips[-1][1] == pixels
+        assert all(before[1] == after[0] for before, after in pairwise(strips))
+        assert all(begin % TILE == 0 for begin, _ in strips)
+
+
+def test_the_arctangent_is_as_good_as_it_says():
+    angle = np.linspace(-np.pi, np.pi, 40_001)
+    for size in (1e-3, 1.0, 30_000.0):
+        frames = [(size * np.cos(angle + 2 * np.pi * n / 3) + 2 * size).astype(np.float32) for n in range(3)]
+        p = (2 * frames[0] - frames[1] - frames[2]) / 3
+        q = (frames[2] - frames[1]) / np.float32(np.sqrt(3))
+        found = turns_of(p, q)
+        exact = np.arctan2(q.astype(float), p.astype(float)) / (2 * np.pi)
+        error = found - exact
+        assert np.abs(error - np.rint(error)).max() <= ARCTAN_ERROR_CYCLES
+
+
+def turns_of(p, q):
+    """The kernel's arctangent at given sums."""
+    sums = np.zeros(5 * TILE, np.float32)
+    gram = np.array([3, 1.5, 1.5, 0, 0, 0], np.float32)
+    out = [np.zeros(TILE, np.float32) for _ in range(5)]
+    found = []
+    for at in range(0, p.size, TILE):
+        size = min(TILE, p.size - at)
+        sums[2 * TILE : 2 * TILE + size] = p[at : at + size]
+        sums[3 * TILE : 3 * TILE + size] = q[at : at + size]
+        _phase(sums, gram, size, *out)
+        found.append(out[0][:size].copy())
+    return np.concatenate(found)

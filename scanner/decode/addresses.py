@@ -1,0 +1,76 @@
+"""Frames by address: how one kernel reads pixels that lie in several arrays, or in the map of a file.
+
+Numba compiles a tuple of arrays anew for every number of frames, and copying the frames into one array would cost as
+much as decoding them. Whoever makes a table of addresses keeps the frames alive and unchanged while it is in use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numba
+import numpy as np
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from scanner.kernel import kernel
+
+CACHE_LINE = 64
+
+_carray = cast(Any, numba).carray
+_compiler = cast(Any, cgutils)
+
+
+def addresses_of(frames: Sequence[NDArray[Any]]) -> NDArray[np.intp]:
+    """(F,) where each frame's first pixel lies.
+
+    Raises:
+        ValueError: a frame is not one block of memory.
+    """
+    if any(not frame.flags.c_contiguous for frame in frames):
+        raise ValueError("a frame without gaps is needed")
+    return np.array([frame.ctypes.data for frame in frames], dtype=np.intp)
+
+
+@kernel
+def pixels_at(address: int, first: int, count: int, like: NDArray[Any]) -> NDArray[Any]:
+    """Pixels first .. first + count - 1 of the frame at `address`, no copy; of the dtype of `like`. For kernels."""
+    return _carray(_pointer(address + first * like.itemsize), (count,), like.dtype)
+
+
+@kernel
+def expect_pixels(address: int, first: int, count: int, like: NDArray[Any]) -> None:
+    """Have the processor fetch pixels that will be asked for soon, while it works on others. For kernels."""
+    begin = address + first * like.itemsize
+    for at in range(begin, begin + count * like.itemsize, CACHE_LINE):
+        _prefetch(at)
+
+
+def _pointer_of_address(typing_context: Any, address: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+    return types.voidptr(types.intp), generate
+
+
+_pointer: Any = cast(Any, intrinsic)(_pointer_of_address)
+
+
+def _prefetch_address(typing_context: Any, address: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        # llvm.prefetch(pointer, read, to the second-level cache, data); it never faults.
+        pointer, integer = _compiler.voidptr_t, ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [pointer, integer, integer, integer])
+        call = _compiler.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        options = [ir.Constant(integer, value) for value in (0, 2, 1)]
+        builder.call(call, [builder.inttoptr(arguments[0], pointer), *options])
+        return context.get_dummy_value()
+
+    return types.void(types.intp), generate
+
+
+_prefetch: Any = cast(Any, intrinsic)(_prefetch_address)

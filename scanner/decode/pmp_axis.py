@@ -1,0 +1,184 @@
+"""One axis of a PMP scan, from its frames to coordinates: a sample is judged, then one pass decodes all pixels.
+
+The pass can be shared by several threads, each taking the next strip of the image when it is done with one; its
+kernels leave the interpreter lock alone. Both axes of a scan are decoded apart and joined at the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode import Map, Reason
+from scanner.decode.agreement import Remainder
+from scanner.decode.neighbours import settle
+from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel
+from scanner.decode.pmp_frames import AxisFrames
+from scanner.decode.pmp_kernels import REASONS, TILE, decode_pixels, join_maps
+from scanner.decode.pmp_sample import PRIOR_FREEDOM, take_sample
+from scanner.decode.unwrapping import Ladder, plan_ladder
+from scanner.patterns import CameraFormat
+from scanner.patterns.pmp import PmpPattern
+
+STRIPS = 6
+"""Strips of the image for each thread: few enough to cost nothing, enough to even out a thread that is held up."""
+
+
+@dataclass(frozen=True)
+class PmpThresholds:
+    """When a pixel is left undecided. None of these was fitted to a scene."""
+
+    saturation: float = 1.0
+    """share of the camera's range from which a sample counts as clipped"""
+    min_modulation_levels: float = 1.0
+    """B in grey levels: rounding makes less than one level a matter of luck"""
+    min_modulation_share: float = 0.01
+    """B as a share of the scan's brightest (99th percentile): light scattered from lit surfaces stays below it"""
+    min_modulation_sigmas: float = 7.0
+    """B over its own noise, which is also 1 over the phase's error in radians. Seven is an error of .023 cycles: no set
+    tells the fringes of one eight times as fine by that"""
+    max_residual_sigmas: float = 5.0
+    """rms residual over noise, and"""
+    max_residual_share: float = 0.35
+    """rms residual over B, both: the scene moved. Uncorrected gamma 2.2 leaves .2"""
+    max_remainder_sigmas: float = 5.0
+    """disagreement of neighbouring rungs over its noise: 6 of ten million pixels by noise alone"""
+    min_unwrap_probability: float = 0.9999
+    """probability that every fringe order is right, given how far each remainder lies from half a fringe"""
+    edge_sigmas: float = 4.0
+    """distance to the pattern's end within which the two ends cannot be told apart"""
+    phase_floor_cycles: float = 0.001
+    """phase error that no modulation removes (8-bit projection, response): 1-sigma a set, in unwrapping only"""
+
+    def clip(self, camera: CameraFormat) -> int:
+        """Grey level from which a sample counts as clipped."""
+        return max(int(np.ceil(self.saturation * camera.max_value)), 1)
+
+
+@dataclass(frozen=True)
+class AxisMaps:
+    """(P,) maps of one axis."""
+
+    position: Map
+    sigma: Map
+    confidence: Map
+    albedo: Map
+    modulation: Map
+    reason: NDArray[np.uint8]
+
+    @classmethod
+    def empty(cls, pixels: int) -> AxisMaps:
+        """Maps to be written."""
+        # np.full writes, np.empty only promises: the system finds the memory now, while frames are being exposed, and
+        # not after the last one.
+        # One block of all maps, rows apart by whole cache lines: large enough for the system's large pages.
+        block = np.full((5, -(-pixels // 16) * 16), 0, np.float32)
+        position, sigma, confidence, albedo, modulation = (row[:pixels] for row in block)
+        return cls(position, sigma, confidence, albedo, modulation, np.full(pixels, 0, np.uint8))
+
+    def join(self, other: AxisMaps) -> NDArray[np.int64]:
+        """Keep what both axes decided; these maps but position and sigma become those of both.
+
+        Returns:
+            (REASONS,) how many pixels have each reason now.
+        """
+        counts = np.zeros(REASONS, np.int64)
+        join_maps(
+            self.position, self.sigma, self.confidence, self.albedo, self.modulation, self.reason,
+            other.position, other.sigma, other.confidence, other.albedo, other.modulation, other.reason, counts,
+        )  # fmt: skip
+        return counts
+
+
+@dataclass(frozen=True)
+class AxisFound:
+    """What one axis's decoding found beside its maps."""
+
+    maps: AxisMaps
+    ladder: Ladder
+    noise: NoiseModel
+    remainders: list[Remainder]
+    settled: int
+    counts: NDArray[np.int64]
+    """(REASONS,) pixels by reason"""
+
+
+def decode_axis(
+    pattern: PmpPattern,
+    along: int,
+    camera: CameraFormat,
+    frames: AxisFrames,
+    maps: AxisMaps,
+    thresholds: PmpThresholds,
+    threads: int,
+) -> AxisFound:
+    """Decode one axis into `maps`.
+
+    Args:
+        along: projector pixels along the axis. threads: that share the pass.
+    """
+    t = thresholds
+    pixels, finest = camera.width * camera.height, finest_of(pattern)
+    # The field's centre as a fraction of it, where the pattern's phase is counted from `origin` before pixel 0.
+    centre = 0.5 + (pattern.origin - 0.5) / along
+    ladder = plan_ladder(pattern.frequencies, frames.gains)
+    sample = take_sample(frames, pixels, camera.max_value, t.clip(camera), t.min_modulation_levels)
+    least = max(t.min_modulation_levels, t.min_modulation_share * sample.brightest(finest))
+    noise = sample.noise(ladder, centre, least, t.min_modulation_sigmas)
+    remainders = sample.agreement(ladder, noise, centre, least, t.min_modulation_sigmas, t.phase_floor_cycles)
+    f32 = partial(np.array, dtype=np.float32)
+    errors2 = ladder.errors**2
+    systematic = np.array([r.systematic for r in remainders], dtype=np.float64)
+    arguments = (
+        frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, t.clip(camera),
+        f32(frames.gains), f32(ladder.combinations), f32(ladder.ratios),
+        f32(errors2), f32(errors2.sum(axis=1) * systematic**2),
+        f32([noise.read, noise.per_level, ROUNDING_VARIANCE, PRIOR_FREEDOM, 1 / (PRIOR_FREEDOM + frames.freedom)]),
+        f32([along, pattern.origin, ladder.frequencies[0] * centre, ladder.frequencies[-1], centre - 0.5]),
+        f32([least, t.min_modulation_sigmas**2, t.max_residual_sigmas**2,
+             t.max_residual_share**2, t.max_remainder_sigmas**2, 1 - t.min_unwrap_probability, t.edge_sigmas]),
+        ladder.periodic, finest,
+    )  # fmt: skip
+    out = (maps.position, maps.sigma, maps.confidence, maps.albedo, maps.modulation, maps.reason)
+
+    def decode(begin: int, end: int) -> NDArray[np.int64]:
+        counts = np.zeros(REASONS, np.int64)
+        decode_pixels(*arguments, begin, end, *out, counts)
+        return counts
+
+    counts = np.sum(in_strips(decode, pixels, threads), axis=0)
+    settled = 0
+    if counts[Reason.UNWRAP_RISK]:
+        per_px = float(ladder.frequencies[-1]) / along
+        settled = settle(maps.position, maps.sigma, maps.confidence, maps.reason, camera.width, per_px)
+        counts[Reason.UNWRAP_RISK] -= settled
+        counts[Reason.VALUE] += settled
+    return AxisFound(maps, ladder, noise, remainders, settled, counts)
+
+
+def finest_of(pattern: PmpPattern) -> int:
+    """Index of the finest set."""
+    f = pattern.frequencies
+    return max(range(len(f)), key=lambda k: (f[k], k))
+
+
+def in_strips(work: Callable[[int, int], Any], pixels: int, threads: int) -> list[Any]:
+    """What `work(begin, end)` returns for strips that make up all pixels, shared among threads; in no order."""
+    if threads == 1 or pixels <= TILE:
+        return [work(0, pixels)]
+    length = -(-pixels // (threads * STRIPS * TILE)) * TILE
+    # The iterator is shared: its next strip goes to whoever asks first.
+    begins = iter(range(0, pixels, length))
+
+    def share() -> list[Any]:
+        return [work(begin, min(begin + length, pixels)) for begin in begins]
+
+    with ThreadPoolExecutor(threads - 1) as pool:
+        others = [pool.submit(share) for _ in range(threads - 1)]
+        return share() + [result for other in others for result in other.result()]

@@ -1,0 +1,83 @@
+"""The frames of one PMP axis in the form kernels take them: where each lies, and what it weighs in its set's fit.
+
+Knows which frames of a set are there, and neither noise nor fringe orders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode.addresses import addresses_of
+from scanner.decode.pmp_kernels import GROUP
+from scanner.patterns import PmpPattern
+from scanner.patterns.description import Axis
+
+
+@dataclass(frozen=True)
+class AxisFrames:
+    """The frames of one axis, by sets; F counts each set's up to a multiple of GROUP.
+
+    frames: kept while addresses are in use. addresses: (F,) intp. starts: (K + 1,) intp, where sets begin.
+    weights: (3, F) float32 of A, p and q. grams: (K, 6) float32 of the normal matrices. gains: (K,) variance of (p, q)
+    over that of one sample. freedom: degrees of freedom of all sets' residuals.
+    """
+
+    frames: Sequence[NDArray[Any]]
+    addresses: NDArray[np.intp]
+    starts: NDArray[np.intp]
+    weights: NDArray[np.float32]
+    grams: NDArray[np.float32]
+    gains: tuple[float, ...]
+    freedom: int
+
+    @property
+    def like(self) -> NDArray[Any]:
+        """An empty array of the frames' dtype."""
+        return np.empty(0, self.frames[0].dtype)
+
+
+def axis_frames(pattern: PmpPattern, axis: Axis, by_fringe: Mapping[int, NDArray[Any]]) -> AxisFrames:
+    """The frames of `axis` that are there, at least three of each set.
+
+    Args:
+        by_fringe: frames without gaps in memory, by fringe index.
+    """
+    frames: list[NDArray[Any]] = []
+    starts, weights, grams, gains, freedom = [0], [], [], [], 0
+    for fringe_set in pattern.sets():
+        if fringe_set.axis != axis:
+            continue
+        have = [n for n in range(fringe_set.shifts) if fringe_set.first + n in by_fringe]
+        design = design_matrix(pattern, fringe_set.shifts, have)
+        gram = design.T @ design
+        inverse = np.linalg.inv(gram)
+        padding = -len(have) % GROUP
+        weights.append(np.pad(inverse @ design.T, ((0, 0), (0, padding))))
+        grams.append([gram[0, 0], gram[1, 1], gram[2, 2], 2 * gram[0, 1], 2 * gram[0, 2], 2 * gram[1, 2]])
+        gains.append(round(float(inverse[1, 1] + inverse[2, 2]) / 2, 9))
+        freedom += len(have) - 3
+        frames += [by_fringe[fringe_set.first + n] for n in have + have[:1] * padding]
+        starts.append(len(frames))
+    return AxisFrames(
+        frames,
+        addresses_of(frames),
+        np.array(starts, np.intp),
+        np.concatenate(weights, axis=1).astype(np.float32),
+        np.array(grams, np.float32),
+        tuple(gains),
+        freedom,
+    )
+
+
+def design_matrix(pattern: PmpPattern, shifts: int, have: Sequence[int]) -> NDArray[np.float64]:
+    """(N, 3) rows [1, cos alpha_n, -sin alpha_n], alpha_n = sign 2 pi n / shifts + offset, for the shifts n in `have`.
+
+    I = A + B cos(theta + alpha_n) = [A, B cos theta, B sin theta] . row.
+    """
+    alpha = pattern.sign * 2 * np.pi * np.asarray(have) / shifts + pattern.offset
+    return np.stack([np.ones_like(alpha), np.cos(alpha), -np.sin(alpha)], axis=1)

@@ -1,0 +1,134 @@
+"""What a sample of pixels tells about a whole PMP scan: its noise, its light, how well its frequencies agree.
+
+A few thousand pixels are fitted before the pass over all of them, so that the pass knows every threshold when it
+begins. Runs of neighbouring pixels lie spread over the image: what is read of a frame then is little, and pixels side
+by side can be compared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode.agreement import PAIR_DISTANCE, Remainder, agreement, noise_of_pairs
+from scanner.decode.noise import NoiseModel, default_noise, fit_noise
+from scanner.decode.pmp_frames import AxisFrames
+from scanner.decode.pmp_kernels import fit_runs
+from scanner.decode.unwrapping import Ladder
+
+SIZE = 4096
+"""Pixels of a first sample: the median of a twelfth of it is good to 5 %, its noise model to 2 %."""
+
+RUN = 64
+"""Pixels side by side: a cache line of each 8-bit frame."""
+
+ENOUGH = 1024
+"""Pixels with light in them that a sample should have; larger ones are taken until it has, or there are no more."""
+
+_GROWTH = 8
+_GOLDEN = (5**0.5 - 1) / 2
+PRIOR_FREEDOM = 8.0
+"""Weight of the scan's noise model against a pixel's own residual, in degrees of freedom (conjugate prior)."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Fits at R runs of L pixels.
+
+    phases, modulations: (K, R, L) float32, cycles and grey levels. mean, residual: (R, L) float32, A and the sum of
+    squared residuals. usable: (R, L) bool, not clipped. gains, freedom: of `AxisFrames`. max_value: of the camera.
+    """
+
+    phases: NDArray[np.float32]
+    modulations: NDArray[np.float32]
+    mean: NDArray[np.float32]
+    residual: NDArray[np.float32]
+    usable: NDArray[np.bool_]
+    gains: NDArray[np.float32]
+    freedom: int
+    max_value: int
+
+    def brightest(self, finest: int) -> float:
+        """99th percentile of the finest set's modulation, grey levels."""
+        b = self.modulations[finest].reshape(-1)
+        return float(np.partition(b, at := int(0.99 * (b.size - 1)))[at])
+
+    def noise(self, ladder: Ladder, centre: float, least: float, sigmas: float) -> NoiseModel:
+        """The scan's noise model, from residuals; where fits leave none (three shifts), from pairs of pixels.
+
+        Args:
+            centre: the field's centre, fraction of it. least, sigmas: modulation a usable pixel of a pair has, in grey
+                levels and over its noise.
+        """
+        if self.freedom:
+            return fit_noise(self.mean[self.usable], self.residual[self.usable], self.freedom, self.max_value)
+        good = self._good(default_noise(self.max_value), least, sigmas)
+        pair = good[:, :-PAIR_DISTANCE] & good[:, PAIR_DISTANCE:]
+        pixels = slice(None, -PAIR_DISTANCE), slice(PAIR_DISTANCE, None)
+        phases = np.stack([self.phases[:, :, at][:, pair] for at in pixels])
+        gains = self.gains[:, None] / np.float32(4 * np.pi**2)
+        per_variance = np.stack([gains / self.modulations[:, :, at][:, pair] ** 2 for at in pixels])
+        level = (self.mean[:, pixels[0]][pair] + self.mean[:, pixels[1]][pair]) * np.float32(0.5)
+        return noise_of_pairs(ladder, phases, per_variance, level, centre, self.max_value)
+
+    def agreement(
+        self, ladder: Ladder, noise: NoiseModel, centre: float, least: float, sigmas: float, floor_cycles: float
+    ) -> list[Remainder]:
+        """How well the ladder's rungs agree where there is enough modulation."""
+        good = self._good(noise, least, sigmas)
+        cycles2 = self._noise_of_b2(noise)[:, good] / (self.modulations[:, good] ** 2 * np.float32(4 * np.pi**2))
+        return agreement(ladder, self.phases[:, good], cycles2, centre, floor_cycles)
+
+    def _good(self, noise: NoiseModel, least: float, sigmas: float) -> NDArray[np.bool_]:
+        enough = np.maximum(np.float32(sigmas**2) * self._noise_of_b2(noise), np.float32(max(least**2, 1e-12)))
+        return np.asarray((self.modulations**2 > enough).all(axis=0) & self.usable)
+
+    def _noise_of_b2(self, noise: NoiseModel) -> NDArray[np.float32]:
+        # The plain form of what the kernel does.
+        model = noise.variance(self.mean)
+        own = (np.float32(PRIOR_FREEDOM) * model + self.residual) / np.float32(PRIOR_FREEDOM + self.freedom)
+        return np.asarray(self.gains[:, None, None] * np.maximum(own, model), dtype=np.float32)
+
+
+def take_sample(frames: AxisFrames, pixels: int, max_value: int, clip: int, least: float) -> Sample:
+    """A sample that has light in it, if the image has.
+
+    Args:
+        pixels: of a frame. clip: grey level from which a sample counts as saturated. least: grey levels of modulation
+            that count as light.
+    """
+    size = SIZE
+    while True:
+        sample = _fit(frames, _runs(pixels, size), min(RUN, pixels), max_value, clip)
+        lit = np.count_nonzero((sample.modulations > least).all(axis=0) & sample.usable)
+        if lit >= ENOUGH or size >= pixels:
+            return sample
+        size *= _GROWTH
+
+
+def _runs(pixels: int, size: int) -> NDArray[np.intp]:
+    """(R,) first pixels of runs, one in each of R equal parts of the image, at places that fall into no step with its
+    width; all of a small image."""
+    length = min(RUN, pixels)
+    if size * 2 >= pixels:
+        return np.arange(0, pixels - length + 1, length, dtype=np.intp)
+    count = size // length
+    within = np.arange(count) * _GOLDEN % 1
+    return ((np.arange(count) + within) * ((pixels - length) / count)).astype(np.intp)
+
+
+def _fit(frames: AxisFrames, runs: NDArray[np.intp], length: int, max_value: int, clip: int) -> Sample:
+    sets, shape = len(frames.gains), (runs.size, length)
+    phases, modulations = (np.empty((sets, runs.size * length), np.float32) for _ in range(2))
+    mean, residual = (np.empty(runs.size * length, np.float32) for _ in range(2))
+    clipped = np.empty(runs.size * length, np.bool_)
+    fit_runs(
+        frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, clip, runs, length,
+        phases, modulations, mean, residual, clipped,
+    )  # fmt: skip
+    return Sample(
+        phases.reshape(sets, *shape), modulations.reshape(sets, *shape), mean.reshape(shape), residual.reshape(shape),
+        ~clipped.reshape(shape), np.array(frames.gains, np.float32), frames.freedom, max_value,
+    )  # fmt: skip
