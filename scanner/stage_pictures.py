@@ -124,7 +124,7 @@ def _curves(values: NDArray[Any]) -> Picture:
     top = 1.1 * float(beyond.max(initial=0)) or 1.0
     for k, curve in enumerate(values):
         box = (60, 12 + k * (height - 40) // count, width - 80, (height - 40) // count - 12)
-        _axes(picture, box, (0.0, len(curve) - 1.0), None)
+        _axes(picture, box, (0.0, len(curve) - 1.0), None, numbers=k == count - 1)
         x, y, w, h = box
         at = np.stack([x + np.arange(len(curve)) * (w / (len(curve) - 1)), y + h * (1 - np.clip(curve / top, 0, 1))])
         line = np.rint(at.T).astype(np.int32)
@@ -152,15 +152,21 @@ def _dots(values: NDArray[Any]) -> Picture:
 
 
 def _axes(
-    picture: Picture, box: tuple[int, int, int, int], across: tuple[float, float], up: tuple[float, float] | None
+    picture: Picture,
+    box: tuple[int, int, int, int],
+    across: tuple[float, float],
+    up: tuple[float, float] | None,
+    *,
+    numbers: bool = True,
 ) -> None:
-    """A frame with round numbers below, and at the left if `up` is given."""
+    """A frame with lines at round numbers, told below if `numbers`, and at the left if `up` is given."""
     x, y, w, h = box
     picture[y : y + h, x : x + w] = PANEL
     for number in ticks(*across, most=12):
         at = x + round((number - across[0]) / (across[1] - across[0]) * w)
         cv2.line(picture, (at, y), (at, y + h), LINE, 1)
-        text(picture, f"{number:g}", (at, y + h + 16), size=13, colour=DIM, align="centre")
+        if numbers:
+            text(picture, f"{number:g}", (at, y + h + 16), size=13, colour=DIM, align="centre")
     for number in ticks(*up) if up is not None else ():
         assert up is not None  # noqa: S101
         at = y + round((up[1] - number) / (up[1] - up[0]) * h)

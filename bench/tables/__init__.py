@@ -8,6 +8,7 @@
     codes         5.1, 5.2      share of right codes after each stage
     depth         5.3-5.7       depth against PMP; first-generation composite pattern
     requirements  what the default decoder must reach
+    pictures      of the page on MCP: `python -m tables.pictures`
 
 Nothing here is part of the program. Every figure follows from seeds 0, 1, 2 of the simulated world; nothing else is
 random, so that a page changes only when the code or the arithmetic of the machine does.

@@ -78,6 +78,6 @@ def index(entries: Sequence[tuple[str, str, str]]) -> str:
         "`make tables` measures all of them on the simulated rig of Casey 2011, sec. 5.6 (one to two minutes);\n"
         '`make tables ARGS="5.1 gamma"` some. "Casey 2011" is C. J. Casey, *Enhancements to the Modified Composite\n'
         "Pattern Method of Structured Light 3D Capture*, University of Kentucky 2011. The decoder is the reference\n"
-        "decoder, `--decoder casey2011`, unless a page says otherwise. How it works: [PMP and\n"
-        "MCP](../../explanation/methods.md).\n\n" + "\n".join(lines) + "\n"
+        "decoder, `--decoder casey2011`, unless a page says otherwise. How it works: [Modified\n"
+        "Composite Pattern](../../explanation/mcp.md).\n\n" + "\n".join(lines) + "\n"
     )

@@ -91,3 +91,11 @@ def test_points_of_the_spheres_middle_alone_are_its_surface(tables: ModuleType) 
         np.array([[3.0, 0, 4], [math.nan, 0, 0], [3, 0, -4]]), np.array([True, True, False])
     )
     assert figures == [3, 0, 4, 4, 0.5, 2]
+
+
+def test_the_pictures_of_the_page_on_mcp_are_small() -> None:
+    pictures = list((ROOT / "docs" / "images" / "mcp").glob("*.png"))
+    page = (ROOT / "docs" / "explanation" / "mcp.md").read_text()
+    assert len(pictures) >= 4
+    assert all(f"images/mcp/{picture.name}" in page for picture in pictures)
+    assert sum(picture.stat().st_size for picture in pictures) < 600_000
