@@ -153,9 +153,11 @@ class Client:
         """{id, state, reason, report, files: [{name, bytes, sha256}], error}."""
         return dict(self.call("scan.result", id=job_id))
 
-    def fetch(self, job_id: str, folder: Path, on_progress: OnProgress | None = None) -> Path:
+    def fetch(
+        self, job_id: str, folder: Path, on_progress: OnProgress | None = None, *, failed_too: bool = False
+    ) -> Path:
         """Bring all files of a scan into `folder`, checked, and acknowledge it; see `scanner.session.fetch`."""
-        return self._run(fetch(job_id, folder, on_progress))
+        return self._run(fetch(job_id, folder, on_progress, failed_too=failed_too))
 
     def cancel(self, job_id: str) -> dict[str, Any]:
         """Stop a job; returns its state. A job that is over stays as it is."""

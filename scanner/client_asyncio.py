@@ -151,9 +151,11 @@ class AsyncClient:
         """{id, state, reason, report, files, error}."""
         return dict(await self.call("scan.result", id=job_id))
 
-    async def fetch(self, job_id: str, folder: Path, on_progress: OnProgress | None = None) -> Path:
+    async def fetch(
+        self, job_id: str, folder: Path, on_progress: OnProgress | None = None, *, failed_too: bool = False
+    ) -> Path:
         """Bring all files of a scan into `folder`, checked, and acknowledge it."""
-        return await self._run(fetch(job_id, folder, on_progress))
+        return await self._run(fetch(job_id, folder, on_progress, failed_too=failed_too))
 
     async def cancel(self, job_id: str) -> dict[str, Any]:
         """Stop a job; returns its state."""

@@ -48,7 +48,7 @@ class Durations:
         for index in sorted(self._bins):
             reached += self._bins[index]
             if reached >= share * self.count:
-                return min((index + 1) * BIN_MS, self.largest_ms)
+                return min((index + 1) * BIN_MS, round(self.largest_ms, 3))
         raise AssertionError("the bins hold all that was counted")
 
     def as_dict(self, *, bins: bool = False) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scanner.errors import ScannerError
 from scanner.geometry import Calibration, calibration_from_dict
 from scanner.session import Call
-from scanner.wire import ErrorBody, LiveHeader, decode_live, error_from_body
+from scanner.wire import TERMINAL_STATES, ErrorBody, LiveHeader, decode_live, error_from_body
 
 Map = NDArray[np.float32]
 
@@ -134,7 +134,7 @@ class LiveWatch:
         lenses = run["live"].get("calibration")
         if lenses is not None and self.calibration is None:
             self.calibration = calibration_from_dict(lenses, name="the daemon's calibration")
-        if run["state"] in ("failed", "cancelled", "done", "acquired"):
+        if run["state"] in TERMINAL_STATES:
             self.finished = True
         if run["state"] == "failed":
             raise _failure(run)

@@ -21,7 +21,7 @@ from scanner.geometry import Calibration
 from scanner.kernel import kernel
 from scanner.patterns import Axis, McpPattern
 from scanner.reconstruct import DecodeOptions, require_sizes
-from scanner.scan import Map, filtered_points
+from scanner.scan import Map, Scan, build_scan, filtered_points
 
 LARGEST = 65535
 
@@ -122,6 +122,15 @@ class LiveReconstruction:
         if rows is None:
             raise AssertionError("an MCP decoder gives the axis of its pattern")
         return LiveResult(quantised(rows, self.scale), int(np.count_nonzero(decoded.reason == Reason.VALUE)))
+
+    def scan(self, frame: Pixels) -> Scan:
+        """One frame to a whole scan, as decoding a capture gives it; for recordings.
+
+        Raises:
+            DecodeError: it shows no pattern, or another one.
+            CalibrationError: the rig cannot triangulate this pattern's axis.
+        """
+        return build_scan(self.decode(frame), self._calibration, self._options.filters)
 
     def _new_decoder(self) -> Decoder:
         return decoder_for(self._header.sequence, self._header.camera, self._options.decoder)

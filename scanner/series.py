@@ -19,6 +19,7 @@ from scanner.errors import DecodeError
 FORMAT = "fringed-series"
 VERSION = 1
 SERIES_FILE = "series.json"
+HEADER_FILE = "capture.json"
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,22 @@ def series_content(
         "frames": sum(frames for _, _, frames in captures),
         "captures": listed,
     }
+
+
+def recording_at(path: Path) -> list[SeriesFolder] | None:
+    """The capture folders of a live recording: of its series, or the one folder given. None: a capture of a scan.
+
+    Raises:
+        DecodeError: series.json is damaged.
+    """
+    if (path / SERIES_FILE).is_file():
+        return read_series(path)
+    file = path / HEADER_FILE if path.is_dir() else path
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        return [SeriesFolder(file.parent, int(content["live"]["first"]))]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None  # whatever is wrong with it, the reader of captures says it better
 
 
 def read_series(folder: Path) -> list[SeriesFolder]:

@@ -204,15 +204,24 @@ def raise_unless_done(outcome: Mapping[str, Any]) -> None:
     raise ScannerError(f"scan {outcome.get('id')} is {outcome['state']}: {outcome.get('reason')}")
 
 
-def fetch(job_id: str, folder: Path, on_progress: OnProgress | None = None) -> Procedure[Path]:
+def fetch(
+    job_id: str, folder: Path, on_progress: OnProgress | None = None, *, failed_too: bool = False
+) -> Procedure[Path]:
     """Bring all of a scan's files: each is checked against its digest and appears whole or not at all.
+
+    Args:
+        job_id: the job.
+        folder: where the files go; it is made.
+        on_progress: told of each piece.
+        failed_too: also of a job that failed: what a live run had recorded by then.
 
     Raises:
         ScannerError: the job did not end well.
         StorageError: no room, or a file arrives damaged twice.
     """
     outcome = yield Call("scan.result", {"id": job_id})
-    raise_unless_done(outcome)
+    if not failed_too:
+        raise_unless_done(outcome)
     files = [msgspec.convert(entry, FileEntry) for entry in outcome["files"]]
     total = sum(entry.bytes for entry in files)
     before = 0

@@ -13,12 +13,12 @@ import logging
 import shutil
 import time
 from collections import deque
-from collections.abc import Awaitable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
 
-from scanner.errors import DeviceBusy, ScannerError, StorageError
+from scanner.errors import DecodeError, DeviceBusy, ScannerError, StorageError
 from scanner.wire import LiveStart, Refused
 from service.devices_link import DevicesLink
 from service.jobs import Job, JobState
@@ -49,7 +49,8 @@ class Live:
         self._workers = workers
         self._endpoint = endpoint
         self._run: LiveRun | None = None
-        self._task: asyncio.Task[None] | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        """of the run, and of those before whose recordings are being closed"""
 
     @property
     def running(self) -> bool:
@@ -68,7 +69,8 @@ class Live:
         job = store.find(params, client)
         if job is not None:
             return job
-        if self._run is not None and not self._run.over.is_set():
+        await self._until_let_go()
+        if self._run is not None and self.running:
             raise DeviceBusy(f"live run {self._run.job.id} is under way", hint="live.stop ends it")
         if (scan := self._pipeline.busy_with) is not None:
             raise DeviceBusy(f"scan {scan.id} is {scan.state}", hint="wait for its end, or cancel it (scan.cancel)")
@@ -81,9 +83,16 @@ class Live:
             self._run = None
             raise
         self._pipeline.tell(job, "queued")
-        self._task = asyncio.create_task(run.run())
-        self._task.add_done_callback(_failed)
+        task = asyncio.create_task(run.run())
+        self._tasks.add(task)
+        task.add_done_callback(self._finished)
         return job
+
+    async def _until_let_go(self) -> None:
+        """A scan that was cancelled gives the devices back soon."""
+        deadline = time.monotonic() + DRAIN_S
+        while (scan := self._pipeline.busy_with) is not None and scan.state.over and time.monotonic() < deadline:
+            await asyncio.sleep(0.01)
 
     async def stop(self, job_id: str | None = None) -> Job:
         """End the run and wait until the devices are free; one that is over stays as it is.
@@ -110,14 +119,13 @@ class Live:
 
     async def close(self) -> None:
         """End the run, recording and all."""
-        if self._run is not None and self._task is not None:
+        if self._run is not None:
             self._run.stop()
-            try:
-                async with asyncio.timeout(2 * DRAIN_S):
-                    await asyncio.shield(self._task)
-            except TimeoutError:
-                self._task.cancel()
-                await asyncio.gather(self._task, return_exceptions=True)
+        if self._tasks:
+            _, late = await asyncio.wait(self._tasks, timeout=2 * DRAIN_S)
+            for task in late:
+                task.cancel()
+            await asyncio.gather(*late, return_exceptions=True)
 
     async def recover(self, job: Job) -> None:
         """Take up a run that an earlier daemon left: what is recorded is kept, nothing goes on."""
@@ -135,6 +143,11 @@ class Live:
             job.become(JobState.ACQUIRED)
         await self._pipeline.end(job, JobState.DONE, reason="daemon_restarted")
 
+    def _finished(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            _log.error("a live run failed", exc_info=error)
+
 
 class LiveRun:
     """One run. Hears the devices (`service.devices_link.ScanListener`)."""
@@ -150,8 +163,7 @@ class LiveRun:
     ) -> None:
         self.job = job
         self.free = asyncio.Event()
-        """the devices are free again"""
-        self.over = asyncio.Event()
+        """devices and worker are free again"""
         self._params = params
         self._pipeline = pipeline
         self._devices = devices
@@ -185,8 +197,11 @@ class LiveRun:
             pipeline.tell(job, "started")
             ending = await self._devices.acquire(job.id, pipeline.spool.capture(job.id), self._params, self)
             self._ended = time.monotonic()
-            self.free.set()
-            await self._finish(ending)
+            await self._end_decoding()
+            if not job.state.over and self._series is not None:
+                job.become(JobState.ACQUIRED)
+                self.free.set()
+            await self._finish(await ending)
         except ScannerError as error:
             await pipeline.end(job, JobState.FAILED, reason="failed", error=error)
         except Exception as error:  # noqa: BLE001  (a run that fails must not end the daemon)
@@ -197,7 +212,6 @@ class LiveRun:
             telling.cancel()
             await asyncio.gather(telling, return_exceptions=True)
             self.free.set()
-            self.over.set()
 
     # --- what the devices say ----------------------------------------------------------------------------------
 
@@ -265,31 +279,31 @@ class LiveRun:
 
     # --- the end -----------------------------------------------------------------------------------------------
 
-    async def _finish(self, ending: Awaitable[Ended]) -> None:
+    async def _finish(self, ended: Ended) -> None:
+        """The recording is closed: list it, and end the job."""
         job, pipeline = self.job, self._pipeline
-        ended, _ = await asyncio.gather(ending, self._end_decoding())
         folder = pipeline.spool.capture(job.id)
-        reason = ended.reason
+        if ended.reason == "cancelled":  # before the first frame
+            await pipeline.end(job, JobState.CANCELLED, reason="cancelled")
+            return
         error = self._failure
-        if reason != "completed" and error is None:
+        if error is None and ended.reason != "completed":
             error = error_of(ended)
         if self._params.retain == "none":
             await asyncio.to_thread(shutil.rmtree, folder.parent, ignore_errors=True)
         elif folder.exists():
             job.files = tuple(await asyncio.to_thread(recorded_files, folder))
-        job.report = self._report(ended)
-        if job.state.over:
-            return
-        if reason is not None:
-            job.become(JobState.ACQUIRED)
+        kept = ended.report.get("kept") or {}
+        self._kept = Kept(job.id, int(kept.get("frames", self._kept.frames)), int(kept.get("bytes", self._kept.bytes)))
+        job.report = self._figures(bins=True)
+        if job.state is JobState.ACQUIRED:
             await pipeline.save(job)
-            pipeline.tell(job, "acquired", {"reason": reason, **job.report})
+            pipeline.tell(job, "acquired", {"reason": ended.reason, **job.report})
         if error is None:
             await pipeline.end(job, JobState.DONE, reason="completed")
-        else:
-            why = "worker_lost" if isinstance(self._failure, ScannerError) and reason == "completed" else None
-            why = "disk_full" if isinstance(error, StorageError) else why
-            await pipeline.end(job, JobState.FAILED, reason=why or reason or reason_to_fail(error), error=error)
+            return
+        reason = ended.reason if ended.reason not in (None, "completed") else _reason(error)
+        await pipeline.end(job, JobState.FAILED, reason=reason or reason_to_fail(error), error=error)
 
     async def _end_decoding(self) -> None:
         series = self._series
@@ -300,10 +314,6 @@ class LiveRun:
             await asyncio.wait({series.outcome}, timeout=DRAIN_S)
         self._workers.cancel(series)
         series.counts.settle(over=True)
-
-    def _report(self, ended: Ended) -> dict[str, Any]:
-        kept = (ended.report or {}).get("kept") or {"frames": self._kept.frames, "bytes": self._kept.bytes}
-        return {**self._figures(bins=True), "recorded": kept}
 
     # --- figures -----------------------------------------------------------------------------------------------
 
@@ -364,6 +374,8 @@ class LiveRun:
                 )
 
 
-def _failed(task: asyncio.Task[None]) -> None:
-    if not task.cancelled() and (error := task.exception()) is not None:
-        _log.error("a live run failed", exc_info=error)
+def _reason(error: ScannerError) -> str | None:
+    """Why a run ended that the daemon ended."""
+    if isinstance(error, StorageError):
+        return "disk_full"
+    return "worker_lost" if isinstance(error, DecodeError) else None

@@ -53,7 +53,6 @@ class LiveRun(Scan):
 
     def run(self, write_backs: WriteBacks) -> None:
         """Take frames, and say `taken` when the devices are free; `ended` follows when the recording is closed."""
-        del write_backs  # the recording has a thread of its own
         calibration = self._opened.calibration
         lenses = None if calibration is None else calibration.as_dict()
         header = CaptureHeader(
@@ -70,19 +69,23 @@ class LiveRun(Scan):
         except ScannerError as error:
             self._say(Ended(self.job, reason_of(error), error=error_body(error)))
             return
-        reason: EndReason = "completed"
         failed: ScannerError | None = None
         try:
             self._say(LiveBegan(self.job, header.as_dict(), lenses))
             self._take_all(storage)
         except ScannerError as error:
-            failed, reason = error, reason_of(error) or "device_lost"
+            failed = error
         finally:
+            write_backs.close_behind(lambda: self._close(storage, failed))
             self._say(Taken(self.job))
-            try:
-                storage.close("complete" if failed is None else "failed", reason)
-            except ScannerError as error:
-                failed, reason = failed or error, "disk_full" if failed is None else reason
+
+    def _close(self, storage: LiveStorage, failed: ScannerError | None) -> None:
+        """Close what is kept, and say `ended`. On a thread of its own."""
+        reason: EndReason = "completed" if failed is None else reason_of(failed) or "device_lost"
+        try:
+            storage.close("complete" if failed is None else "failed", reason)
+        except ScannerError as error:
+            failed, reason = failed or error, "disk_full" if failed is None else reason
         body = None if failed is None else error_body(failed)
         report = {"lost": self._lost, "kept": {"frames": self._kept.frames, "bytes": self._kept.bytes}}
         self._say(Ended(self.job, reason, self._lines, error=body, report=report))

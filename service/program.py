@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import typer
 
 from scanner.errors import ScannerError, StorageError
-from service.commands import audit, check_config, daemon, decode, devices, patterns, scan, simulate
+from service.commands import audit, check_config, daemon, decode, devices, live, patterns, scan, simulate
 from service.terminal import error_document, print_error, print_json
 
 FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
@@ -33,6 +33,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command()(scan.scan)
+app.command()(live.live)
 app.command()(decode.decode)
 app.command()(audit.audit)
 app.command()(patterns.patterns)

@@ -97,13 +97,23 @@ class WriteBacks:
 
     def __init__(self) -> None:
         self._last: WriteBack | None = None
+        self._closing: threading.Thread | None = None
 
     def of(self, writer: CaptureWriter, frame_bytes: int) -> WriteBack:
         """The next capture's."""
         self._last = WriteBack(writer, frame_bytes, self._last)
         return self._last
 
+    def close_behind(self, close: Callable[[], None]) -> None:
+        """Run what closes a recording while the devices go on. Waits for the one before."""
+        if self._closing is not None:
+            self._closing.join()
+        self._closing = threading.Thread(target=close, name="live-close")
+        self._closing.start()
+
     def wait(self) -> None:
         """Wait until everything is closed."""
         if self._last is not None:
             self._last.join()
+        if self._closing is not None:
+            self._closing.join()

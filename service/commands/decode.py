@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from service.commands.decode_recording import decode_recording
 from service.commands.options import (
     AsJson,
     Box,
@@ -36,6 +37,9 @@ def decode(
             metavar="DIR", parser=output_path, help="Folder for pictures of the decoder's stages, 01-input.png and on."
         ),
     ] = None,
+    frames: Annotated[
+        str | None, typer.Option(metavar="FIRST:LAST", help="Recordings of live runs: these frames only, as 100:109.")
+    ] = None,
     depth: Depth = None,
     box: Box = None,
     min_confidence: MinConfidence = None,
@@ -46,9 +50,10 @@ def decode(
     force: Force = False,
     as_json: AsJson = False,
 ) -> int:
-    """Decode a capture into a point cloud.
+    """Decode a capture into a point cloud, or each frame of a recorded live run into one.
 
-    Without -o the files go to the folder scan beside the capture's JSON file.
+    Without -o the files go to the folder scan beside the capture's JSON file; those of a recording to a folder for
+    each frame in there.
 
     \b
     Examples:
@@ -56,9 +61,19 @@ def decode(
       fringed decode skull/capture-gray.json --calibration skull/calibration.json
       fringed decode old/capture --depth 380:430 --force
       fringed decode scan/capture -o again --decoder casey2011 --stages pictures
+      fringed decode take1 --frames 100:109                a recording of fringed live
     """
     filters = filter_members(depth, box, min_confidence, edge_filter=edge_filter)
     began = time.monotonic()
+    from scanner.series import recording_at  # noqa: PLC0415
+
+    if recording_at(capture) is not None:
+        if stages is not None or compare_truth:
+            raise typer.BadParameter("--stages and --compare-truth say nothing to a recording of a live run")
+        settings = {"decoder": decoder, "filters": filters}
+        return decode_recording(capture, calibration, output, settings, frames, force=force, as_json=as_json)
+    if frames is not None:
+        raise typer.BadParameter("--frames chooses from a recording of a live run, and this is none")
     with progress_lines() as lines:
         lines.stage("opening the capture")
         from scanner.capture import Capture  # noqa: PLC0415  (array libraries and kernels)

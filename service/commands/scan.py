@@ -96,7 +96,7 @@ def scan(
     members = PatternOptions(frequencies, shifts, axis, bits, carriers, profile, levels).members(method)
     params: dict[str, Any] = {
         "pattern": members or None,
-        "exposure": None if exposure is None else _exposure(exposure),
+        "exposure": None if exposure is None else exposure_given(exposure),
         "decoder": decoder,
         "filters": filter_members(depth, box, min_confidence, edge_filter=edge_filter),
         "compare_truth": compare_truth,
@@ -104,7 +104,7 @@ def scan(
     }
     folder = output or _fresh_folder()
     began = time.monotonic()
-    with _output(folder, force=force), progress_lines() as lines, _daemon(rig, connect, lines) as endpoint:
+    with _output(folder, force=force), progress_lines() as lines, rig_daemon(rig, connect, lines) as endpoint:
         _scan(endpoint, method, params, folder, lines)
         lines.stage("ending")
     report_result(folder, time.monotonic() - began, lines.spent, as_json=as_json)
@@ -118,7 +118,12 @@ def _fresh_folder() -> Path:
     return next(folder for folder in map(Path, chain([name], numbered)) if not folder.exists())
 
 
-def _exposure(text: str) -> float | Literal["auto"]:
+def exposure_given(text: str) -> float | Literal["auto"]:
+    """An exposure as the command line has it: auto, or microseconds.
+
+    Raises:
+        typer.BadParameter: neither.
+    """
     if text == "auto":
         return "auto"
     try:
@@ -150,7 +155,7 @@ def _output(folder: Path, *, force: bool) -> Iterator[None]:
 
 
 @contextmanager
-def _daemon(rig: str | None, connect: str | None, lines: ProgressLines) -> Iterator[str]:
+def rig_daemon(rig: str | None, connect: str | None, lines: ProgressLines) -> Iterator[str]:
     """Endpoint of the daemon to ask: the one named, or a private one with this rig."""
     if connect is not None:
         yield connect
