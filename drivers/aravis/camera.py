@@ -61,6 +61,7 @@ class AravisCamera:
         self._ids = _Unwrapped()
         self._next_clock_ns = 0
         self._losses = 0
+        self._counted = False
         self._ended_counts: Mapping[str, int] = {}
         self._finder: threading.Thread | None = None
         self._closing = threading.Event()
@@ -149,6 +150,22 @@ class AravisCamera:
             if left_s <= 0:
                 return None
 
+    def execute(self, command: str) -> None:
+        """Run a command of the camera's own, by its GenICam name.
+
+        Raises:
+            DeviceError: it has no such command, or refuses.
+        """
+        self._check_open()
+        link = self._present_link()
+        link.call(lambda: link.features.execute(command))
+
+    def triggers_counted(self) -> int | None:
+        """Triggers that the camera has counted since `start`, those included that gave no frame; None: it cannot."""
+        self._check_open()
+        link = self._present_link()
+        return link.call(lambda: triggers.read_count(link.features)) if self._counted else None
+
     def stop(self) -> None:
         """End acquisition; may be called twice."""
         if self._mode is None:
@@ -225,7 +242,7 @@ class AravisCamera:
     def _begin(self, link: Link, mode: TriggerMode) -> None:
         features = link.features
         source = triggers.set_mode(features, mode, self._options, self._name)
-        counted = triggers.count_triggers(features, source, self._options)
+        counted = self._counted = triggers.count_triggers(features, source, self._options)
         if mode is TriggerMode.FREE:
             self._set_rate(link)
         link.read_clock()

@@ -26,8 +26,8 @@ class Options:
     packet_socket: bool = False
     """Aravis's faster way in, for those who may (CAP_NET_RAW); off, so that all users see the same"""
     socket_buffer_frames: int = field(default=4, metadata={"low": 1, "high": 64})
-    buffers: int = field(default=16, metadata={"low": 2, "high": 1024})
-    """frames that may wait for a host that is slow"""
+    buffers: int | None = field(default=None, metadata={"low": 2, "high": 1024})
+    """frames that may wait for a host that is slow; None: 8 to 64, as 256 MB allow"""
     frame_rate_hz: float | None = field(default=None, metadata={"low": 0.01, "high": 100_000.0})
     """free run; None: as fast as the camera can"""
     binning: int = field(default=1, metadata={"low": 1, "high": 16})

@@ -6,11 +6,15 @@ all are full, frames are lost and counted (underruns), and the camera's count of
 
 from __future__ import annotations
 
+import os
+import socket
+import stat
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,13 +30,18 @@ POP_US = 20_000
 NO_LEADER = (1 << 64) - 1
 """Frame id of a buffer whose first packet never came: nothing else in it is known, either"""
 
-RESEND_WAIT_US = 3_000
-"""A packet that is out of its turn for so long is asked for again"""
+RESEND_WAIT_US = 10_000
+"""A frame whose packets stopped coming for so long is asked for the rest. A sender that only paused would be asked for
+what it is about to send, and slowed down further: no shorter"""
 
-RETENTION_US = 300_000
+RETENTION_US = 100_000
 """A frame whose packets stopped coming for so long is given up"""
 
-REQUEST_RATIO = 0.5
+BUFFERED_BYTES = 256 << 20
+LEAST_BUFFERS, MOST_BUFFERS = 8, 64
+"""While one frame waits for its packets, those behind it fill buffers: 64 are more than RETENTION_US at 500 Hz"""
+
+REQUEST_RATIO = 1.0
 """Share of a frame's packets that may be asked for again"""
 
 
@@ -73,7 +82,8 @@ class Stream:
         self._parser = camera.create_chunk_parser() if counted else None
         self._heard = heard
         self._arrays: dict[Any, NDArray[np.uint8]] = {}
-        for _ in range(options.buffers):
+        fitting = min(max(BUFFERED_BYTES // max(1, self._payload), LEAST_BUFFERS), MOST_BUFFERS)
+        for _ in range(options.buffers or fitting):
             content = np.zeros(self._payload, dtype=np.uint8)
             buffer = library.Buffer.new(self._payload, content.ctypes.data)
             self._arrays[buffer] = content
@@ -136,6 +146,8 @@ class Stream:
         stream.set_property("socket-buffer", library.GvStreamSocketBuffer.FIXED)
         stream.set_property("socket-buffer-size", buffer_bytes(self._payload, options.socket_buffer_frames))
         resend = library.GvStreamPacketResend
+        # The library does so when the first packet is there: too late for the frame it belongs to.
+        _set_receive_buffer(int(stream.get_port()), buffer_bytes(self._payload, options.socket_buffer_frames))
         stream.set_property("packet-resend", resend.ALWAYS if options.resend else resend.NEVER)
         stream.set_property("packet-request-ratio", REQUEST_RATIO)
         stream.set_property("packet-timeout", RESEND_WAIT_US)
@@ -180,3 +192,19 @@ class Stream:
             if is_library_error(error):  # the chunk is not in this frame
                 return None
             raise
+
+
+def _set_receive_buffer(port: int, size: int) -> None:
+    """Of this process's UDP socket at `port`, which the library keeps to itself."""
+    for entry in list(Path("/proc/self/fd").iterdir()):
+        try:
+            duplicate = os.dup(int(entry.name))
+        except OSError:  # the descriptor of the listing itself
+            continue
+        try:
+            if stat.S_ISSOCK(os.fstat(duplicate).st_mode):
+                with socket.socket(fileno=os.dup(duplicate)) as one:
+                    if one.family == socket.AF_INET and one.type == socket.SOCK_DGRAM and one.getsockname()[1] == port:
+                        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
+        finally:
+            os.close(duplicate)

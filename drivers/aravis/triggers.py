@@ -76,6 +76,11 @@ def count_triggers(features: Features, source: str | None, options: Options) -> 
     return True
 
 
+def read_count(features: Features) -> int | None:
+    """The counter as it stands now."""
+    return features.get_or_none("CounterValue", int)
+
+
 def _switch_off_all(features: Features) -> str | None:
     """Every trigger off; returns the selector of the one that starts a frame, None where there is no choice."""
     selectors = features.entries("TriggerSelector")

@@ -12,7 +12,6 @@ import ipaddress
 import select
 import socket
 import threading
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,6 +23,7 @@ from drivers.simulated.gige_control import PORT, Control
 from drivers.simulated.gige_registers import Identity, Refused, Registers
 from drivers.simulated.gige_sensor import DeviceClock, Sensor
 from drivers.simulated.gige_stream import Stream, StreamCounts
+from drivers.simulated.lines import Regular
 from drivers.simulated.options import Settings, read_settings
 from drivers.simulated.world import NOMINAL_EXPOSURE_NS, World, enter_world
 from scanner.clock import Clock
@@ -263,18 +263,9 @@ class GigeCamera:
     def _start_line(self, _: int) -> None:
         """Pulses on Line1, at a period of this machine's clock."""
         period_ns, count = 1000 * self._registers.word(f.LINE_PERIOD), self._registers.word(f.LINE_COUNT)
-        sensor, begun = self._sensor, self._clock.now_ns()
-
-        def give() -> None:
-            for i in range(count):
-                t_ns = begun + i * period_ns
-                while not self._dead.is_set() and (left := t_ns - self._clock.now_ns()) > 0:
-                    time.sleep(min(left / 1e9, HEARTBEAT_LOOK_S))
-                if self._dead.is_set():
-                    return
-                sensor.pulse(t_ns)
-
-        threading.Thread(target=give, name="simulated line", daemon=True).start()
+        train = Regular(self._clock.now_ns() + period_ns, period_ns)
+        train.end(self._clock.now_ns() + count * period_ns + period_ns // 2)
+        self._sensor.listen(train)
 
 
 def _settings(device: str, wire: WireOptions) -> Settings:

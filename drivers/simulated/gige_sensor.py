@@ -23,7 +23,7 @@ from drivers.simulated import gige_features as f
 from drivers.simulated.gige_pixels import BITS, binned, packed, payload_bytes
 from drivers.simulated.gige_registers import Refused, Registers
 from drivers.simulated.gige_stream import Picture, Stream
-from drivers.simulated.lines import LineName
+from drivers.simulated.lines import Line, LineName
 from drivers.simulated.options import CameraOptions
 from drivers.simulated.world import World
 from scanner.devices import Pixels
@@ -100,11 +100,12 @@ class Sensor:
         self._numbers = 0
         self._block = 0
         self._ring: list[Pixels] = []
+        self._own_line: Line | None = None
         self.dropped_triggers = 0
         """since the last start"""
         self._open = True
         self._line_seen_ns = 0
-        _ = world.view, world.electrons_per_light
+        self._warm_up()
         self._thread = threading.Thread(target=self._run, name="simulated sensor", daemon=True)
         self._thread.start()
 
@@ -113,9 +114,6 @@ class Sensor:
         with self._changed:
             self._forget()
             setting = self._read_setting()
-            length = setting.exposure_ns
-            begun = self._clock.now_ns() - length
-            self._ring = [self._render(begun, length, setting, number) for number in range(self._options.ring)]
             self._next_free_ns = self._idle_ns = self._line_seen_ns = self._clock.now_ns()
             self._setting = setting
             self._changed.notify_all()
@@ -141,6 +139,12 @@ class Sensor:
         with self._changed:
             self._line_edges.append(t_ns)
         self._trigger(t_ns, f.LINE1_SOURCE)
+
+    def listen(self, line: Line) -> None:
+        """Hear the edges of this line, too, until the acquisition ends."""
+        with self._changed:
+            self._own_line = line
+            self._changed.notify_all()
 
     def reset_counter(self) -> None:
         """CounterReset."""
@@ -171,7 +175,7 @@ class Sensor:
             latency_us = self._options.trigger_latency_us if software else self._options.line_latency_us
             start = t_ns + setting.delay_ns + round(1e3 * latency_us)
             if start < self._idle_ns:
-                waiting = sum(shot.start_ns > start for shot in self._shots)
+                waiting = sum(shot.start_ns > t_ns for shot in self._shots)
                 if waiting >= self._queue:
                     self.dropped_triggers += 1
                     return
@@ -201,16 +205,21 @@ class Sensor:
             self._next_free_ns = start + setting.period_ns
 
     def _watch_line(self, now_ns: int) -> None:
-        """Edges on the world's line that are past; those of the camera's own generator come by `pulse`."""
-        line = self._world.lines.get(cast("LineName", self._options.line))
-        while line is not None and (edge := line.next_edge(self._line_seen_ns)) is not None and edge <= now_ns:
-            self._line_seen_ns = edge
-            self.pulse(edge)
+        """Edges that are past, on the world's line and on the camera's own, in the order of their times."""
+        lines = [line for line in (self._line, self._own_line) if line is not None]
+        while edges := [e for line in lines if (e := line.next_edge(self._line_seen_ns)) is not None and e <= now_ns]:
+            self._line_seen_ns = min(edges)
+            self.pulse(self._line_seen_ns)
+
+    @property
+    def _line(self) -> Line | None:
+        return self._world.lines.get(cast("LineName", self._options.line))
 
     def _run(self) -> None:
         while True:
             if self._setting is not None:
                 self._watch_line(self._clock.now_ns())
+            self._fill_ring()
             with self._changed:
                 if not self._open:
                     return
@@ -226,7 +235,7 @@ class Sensor:
 
     @property
     def _longest_wait_s(self) -> float:
-        return LONGEST_WAIT_S if self._world.lines.get(cast("LineName", self._options.line)) is None else LINE_WAIT_S
+        return LONGEST_WAIT_S if self._line is None and self._own_line is None else LINE_WAIT_S
 
     def _wait_ns(self, now_ns: int, setting: _Setting | None, shot: _Shot | None) -> float:
         """Until there is something to do."""
@@ -256,6 +265,25 @@ class Sensor:
         stamp = self._device_clock.ticks(shot.start_ns)
         picture = Picture(setting.pixel_format, width, height, x, y, stamp, bool(setting.chunks))
         self._stream.send(block, picture, memoryview(content), setting.packet_bytes, setting.packet_delay_s)
+
+    def _fill_ring(self) -> None:
+        """The ring's frames, of what shone just before; a client need not wait for the answer to its start."""
+        setting = self._setting
+        if setting is None or self._ring or not self._options.ring:
+            return
+        begun = self._clock.now_ns() - setting.exposure_ns
+        ring = [self._render(begun, setting.exposure_ns, setting, number) for number in range(self._options.ring)]
+        with self._changed:
+            if self._setting is setting:
+                self._ring = ring
+                self._next_free_ns = self._clock.now_ns()
+
+    def _warm_up(self) -> None:
+        """Compile, cast, and allocate before anybody waits for a frame."""
+        width, height = self._world.rig.calibration.camera.size
+        for kind, bits in ((np.uint8, 8), (np.uint16, 12)):
+            scratch: Any = np.empty((height, width), dtype=kind)
+            self._world.render(self._clock.now_ns() - 1_000_000, 1_000_000, self._rolling_ns, 0.0, bits, 0, scratch)
 
     def _render(self, start_ns: int, exposure_ns: int, setting: _Setting, number: int) -> Pixels:
         width, height = self._world.rig.calibration.camera.size
@@ -345,6 +373,8 @@ class Sensor:
         )
 
     def _forget(self) -> None:
+        self._ring = []
+        self._own_line = None
         self._shots.clear()
         self._frame_triggers.clear()
         self._exposures.clear()

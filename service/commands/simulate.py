@@ -11,6 +11,9 @@ import typer
 from service.commands.options import AsJson
 from service.terminal import print_facts, print_json
 
+BUFFERS = 64
+"""Frames that a GigE camera's memory holds while the wire is busy: 128 MB of small ones"""
+
 group = typer.Typer(
     help="Simulated devices on real wires, for drivers and programs that know nothing of this project.",
     rich_markup_mode=None,
@@ -34,6 +37,7 @@ def gige(
     queue: Annotated[int, typer.Option(min=0, max=64, help="Triggers remembered while busy; 0: dropped.")] = 0,
     link: Annotated[float, typer.Option(metavar="MBIT/S", min=0.0, help="Speed of the wire; 0: unlimited.")] = 0.0,
     ring: Annotated[int, typer.Option(min=0, max=4096, help="Send so many prepared frames in turn: fast.")] = 0,
+    readout: Annotated[float, typer.Option(metavar="MS", min=0.01, max=1000.0, help="Duration of a readout.")] = 5.0,
     shutter: Annotated[str, typer.Option(help="global or rolling")] = "global",
     light: Annotated[
         Path | None, typer.Option(metavar="PATH", help="Socket at which a simulated projector finds the camera.")
@@ -57,7 +61,7 @@ def gige(
     serve = load_simulator("gige")
     start_logging("simulate")
     wire = {"loss": loss, "queue": queue, "link_mbit_s": link}
-    options = {"ring": ring, "shutter": shutter}
+    options = {"ring": ring, "shutter": shutter, "readout_us": 1e3 * readout, "buffers": BUFFERS}
     with serve(device, address=address, count=count, light=light, wire=wire, options=options) as service:
         if calibration is not None:
             service.write_calibration(calibration)
