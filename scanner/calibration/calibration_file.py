@@ -1,0 +1,116 @@
+"""A solution as a calibration file (formats.md, Calibration): human-readable, with an id that is its content's hash."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.calibration.problem import NAMES
+from scanner.calibration.solve import Solution
+from scanner.geometry import calibration_from_dict
+
+RIG_PARAMETERS = 24
+"""Of NAMES: both lenses, rotation and translation. The sheet's are the target's business."""
+
+
+def calibration_dict(solution: Solution, created: str | None = None) -> dict[str, Any]:
+    """The file's content, checked as a reader would.
+
+    Raises:
+        CalibrationError: what was found is no geometry that scans can use (a lens that folds its picture).
+    """
+    content: dict[str, Any] = {
+        "created": created or datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        **solution.geometry.as_dict(),
+        "world": None,
+        "hall": None,
+        "mcp_phase": None,
+        "response": None if solution.response is None else {"projector": solution.response, "camera": None},
+        **solution.extra,
+        "covariance": _covariance(solution),
+        "scale": _scale(solution),
+        "residuals": _residuals(solution),
+        "target": {
+            "spec": solution.target.spec,
+            "scale_x": float(solution.state.sheet[0]),
+            "scale_y": float(solution.state.sheet[1]),
+            "bow_mm": float(solution.state.sheet[2]),
+        },
+        "warm_up": {
+            "minutes": solution.options.warm_up_minutes,
+            "first_capture": solution.created[0] or None,
+            "last_capture": solution.created[1] or None,
+        },
+    }
+    content["id"] = content_id(content)
+    order = ("format", "version", "id", "created", "units")
+    content = {key: content[key] for key in (*order, *(key for key in content if key not in order))}
+    calibration_from_dict(content, name="the calibration found")
+    return content
+
+
+def content_id(content: dict[str, Any]) -> str:
+    """16 hexadecimal digits of SHA-256 over everything but id and date: equal rigs have equal ids."""
+    plain = {key: value for key, value in content.items() if key not in ("id", "created")}
+    return hashlib.sha256(json.dumps(plain, sort_keys=True, separators=(",", ":")).encode()).hexdigest()[:16]
+
+
+def as_text(content: dict[str, Any]) -> str:
+    """JSON that a person can read: one line a matrix row."""
+    text = json.dumps(content, indent=1)
+    # The innermost lists are rows of numbers: each on one line.
+    return (
+        re.sub(r"\[[^\[\]{}]*\]", lambda m: re.sub(r"\s+", " ", m.group()).replace("[ ", "[").replace(" ]", "]"), text)
+        + "\n"
+    )
+
+
+def rms(residuals: NDArray[Any]) -> float:
+    """Of points: the root of their mean squared distance."""
+    return float(np.sqrt((np.asarray(residuals) ** 2).sum(axis=-1).mean()))
+
+
+def _covariance(solution: Solution) -> dict[str, Any]:
+    part = solution.adjusted.covariance[:RIG_PARAMETERS, :RIG_PARAMETERS]
+    return {
+        "parameters": list(NAMES[:RIG_PARAMETERS]),
+        "units": "px, 1, rad (rotation vector), mm",
+        "sigma": np.sqrt(np.clip(np.diag(part), 0, None)).tolist(),
+        "matrix": part.tolist(),
+    }
+
+
+def _scale(solution: Solution) -> Any:
+    length = solution.problem.length
+    return "unverified" if length is None else {"reference_mm": length.mm, "sigma_mm": length.sigma_mm}
+
+
+def _residuals(solution: Solution) -> dict[str, Any]:
+    adjusted = solution.adjusted
+    views = []
+    for k, view in enumerate(solution.problem.views):
+        kept = adjusted.kept[k]
+        held_out = float(solution.held_out[k])
+        views.append(
+            {
+                "name": view.name,
+                "points": int(kept.sum()),
+                "outliers": int((~kept).sum()),
+                "camera_px": rms(adjusted.camera_residuals[k][kept]) if kept.any() else None,
+                "projector_px": rms(adjusted.projector_residuals[k][kept]) if kept.any() else None,
+                "epipolar_px": float(np.sqrt((solution.epipolar[k] ** 2).mean())),
+                "held_out_px": held_out if np.isfinite(held_out) else None,
+            }
+        )
+    return {
+        "camera_px": rms(np.concatenate(adjusted.camera_residuals)),
+        "projector_px": rms(np.concatenate(adjusted.projector_residuals)),
+        "epipolar_px": float(np.sqrt((np.concatenate(solution.epipolar) ** 2).mean())),
+        "views": views,
+    }

@@ -1,0 +1,170 @@
+"""From a capture of a target to what the adjustment takes: its points in camera and projector.
+
+A capture that cannot serve (one axis only, out of step, no target in it) gives a reason, not an error: a folder of
+poses of which some are unusable still calibrates, and says which were left out and why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.calibration.detection import FEWEST_POINTS, NotFound, detect
+from scanner.calibration.problem import View
+from scanner.calibration.projector_points import projector_points
+from scanner.calibration.targets import Target
+from scanner.capture import Capture
+from scanner.decode import Decoded, decoder_for
+from scanner.errors import ConfigError, ScannerError, SyncError
+from scanner.sequencer import check_capture
+
+HEADER_FILE = "capture.json"
+DEEPEST = 3
+"""Folders below one that is named in which captures are looked for."""
+FLATTEST = 0.02
+"""Width over length of a view's points on the target, below which they lie on a line."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """One usable capture. response: what its patterns were corrected for; created: when it was taken."""
+
+    view: View
+    camera_size: tuple[int, int]
+    projector_size: tuple[int, int]
+    response: dict[str, Any] | None = None
+    created: str = ""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A capture that could not be used."""
+
+    name: str
+    reason: str
+    out_of_step: bool = False
+
+
+def find_captures(paths: Sequence[Path]) -> list[Path]:
+    """The captures that paths name: a capture folder, its JSON file, a scan's folder, or a folder of those, sorted.
+
+    Raises:
+        ConfigError: a path is not there, or holds no capture.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not path.exists():
+            raise ConfigError(f"no such capture: {path}")
+        here = [path] if path.is_file() else list(_below(path, DEEPEST))
+        if not here:
+            raise ConfigError(f"{path} holds no capture", hint=f"a capture is a folder with a {HEADER_FILE} in it")
+        found += [capture for capture in here if capture not in found]
+    return found
+
+
+def observe(
+    paths: Sequence[Path], target: Target, progress: Callable[[int, int], None] | None = None
+) -> tuple[list[Observation], list[LeftOut]]:
+    """Look at every capture; see `observe_capture`. progress is told (done, total)."""
+    observations, left_out = [], []
+    names = _names(paths)
+    for done, (path, name) in enumerate(zip(paths, names, strict=True)):
+        outcome = observe_capture(path, name, target)
+        if isinstance(outcome, Observation):
+            observations.append(outcome)
+        else:
+            left_out.append(outcome)
+        if progress is not None:
+            progress(done + 1, len(paths))
+    return observations, left_out
+
+
+def observe_capture(path: Path, name: str, target: Target) -> Observation | LeftOut:
+    """Decode one capture and find the target in it."""
+    try:
+        capture = Capture.open(path)
+        sequence = capture.header.sequence
+        axes = set(getattr(sequence.pattern, "axes", ()))
+        if axes != {"x", "y"}:
+            return LeftOut(name, "its patterns run along one axis only: capture with --axis xy")
+        check_capture(capture).raise_if_out_of_step()
+        decoder = decoder_for(sequence, capture.header.camera)
+        for pattern in capture.records:
+            if pattern < len(sequence):
+                decoder.add(pattern, capture.frame(pattern))
+        decoded = decoder.finish()
+        white = None if sequence.white is None else capture.frame(sequence.white)
+    except SyncError as error:
+        return LeftOut(name, f"frames out of step: {error}", out_of_step=True)
+    except ScannerError as error:
+        return LeftOut(name, str(error))
+    view = observe_decoded(name, decoded, target, white=white, mosaic=capture.header.camera.mosaic is not None)
+    if isinstance(view, LeftOut):
+        return view
+    camera, projector = capture.header.camera, sequence.projector
+    correction = sequence.precorrection
+    return Observation(
+        view,
+        (camera.width, camera.height),
+        (projector.width, projector.height),
+        None if correction is None else correction.describe(),
+        capture.header.created,
+    )
+
+
+def observe_decoded(
+    name: str,
+    decoded: Decoded,
+    target: Target,
+    *,
+    white: NDArray[Any] | None = None,
+    mosaic: bool = False,
+) -> View | LeftOut:
+    """The target's points in decoded maps; in the white frame where there is one and it shows the target, else in the
+    albedo, which is the mean of many frames. Pictures with a colour mosaic are smoothed over its 2 x 2 sites."""
+    found: Any = NotFound("no picture")
+    for picture in (white, decoded.albedo):
+        if picture is None:
+            continue
+        # 1 2 1 in both directions weighs the four sites of a mosaic alike wherever it stands, and moves nothing.
+        plain = np.asarray(picture, dtype=np.float32)
+        found = detect(cv2.GaussianBlur(plain, (3, 3), 0.85) if mosaic else plain, target)
+        if not isinstance(found, NotFound):
+            break
+    if isinstance(found, NotFound):
+        return LeftOut(name, found.reason)
+    seen = projector_points(decoded, found.points, found.spacing)
+    kept = np.isfinite(seen.points).all(axis=1) & np.isfinite(seen.slope).all(axis=(1, 2))
+    if kept.sum() < FEWEST_POINTS:
+        return LeftOut(name, f"the projector's pixel is known of {int(kept.sum())} points only: light the whole target")
+    on_target = target.points[found.ids[kept]]
+    extents = np.linalg.svd(on_target - on_target.mean(axis=0), compute_uv=False)
+    if extents[1] < FLATTEST * extents[0]:
+        return LeftOut(name, "the points that are seen lie on a line")
+    return View(name, found.ids[kept], found.points[kept], seen.points[kept], seen.sigma[kept], seen.slope[kept])
+
+
+def _below(folder: Path, depth: int) -> Iterator[Path]:
+    if (folder / HEADER_FILE).is_file():
+        yield folder
+    elif depth:
+        for child in sorted(folder.iterdir()):
+            if child.is_dir():
+                yield from _below(child, depth - 1)
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Short names that tell the captures apart: the folder's, and its parents' where that does not do."""
+    parts = [(path.parent if path.name == HEADER_FILE else path).absolute().parts for path in paths]
+    parts = [part[:-1] if part[-1] == "capture" and len(part) > 1 else part for part in parts]
+    for length in range(1, max(map(len, parts), default=1) + 1):
+        names = ["/".join(part[-length:]) for part in parts]
+        if len(set(names)) == len(names):
+            return names
+    return [str(path) for path in paths]

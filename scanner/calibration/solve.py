@@ -1,0 +1,351 @@
+"""From observed views to a rig: start, adjustment, bad views out, a held-out view's error, checks.
+
+`Solution` carries everything a report needs; `calibration_file` writes it. Nothing is written from here, and a result
+that cannot be is an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.calibration.adjustment import Adjusted, adjust
+from scanner.calibration.discs import eccentricity
+from scanner.calibration.held_out import held_out_errors
+from scanner.calibration.lens_slopes import rotation_of
+from scanner.calibration.observe import LeftOut, Observation
+from scanner.calibration.plausibility import (
+    MISMATCH,
+    Facing,
+    check_facing,
+    check_motion,
+    check_state,
+    check_stated,
+)
+from scanner.calibration.problem import (
+    CAMERA,
+    POSES,
+    PROJECTOR,
+    SHEET,
+    SHIFT,
+    TURN,
+    Length,
+    Priors,
+    Problem,
+    State,
+    View,
+    sheet_points,
+)
+from scanner.calibration.start import FEWEST_VIEWS, start
+from scanner.calibration.targets import Target
+from scanner.errors import CalibrationError
+from scanner.geometry import Calibration
+
+Array = NDArray[np.float64]
+
+BAD_VIEW = 4.0
+"""A view whose residual is so many times the median of all views' is bad, and"""
+BAD_VIEW_PX = 0.15
+"""more than this: sharp targets differ from pose to pose by their blur alone, within a tenth of a pixel."""
+DISC_ROUNDS = 3
+"""Of adjustment and the discs' eccentricity in turn."""
+FEW_VIEWS = 6
+MOST_ENTRIES = 12_000_000
+"""Of the adjustment's Jacobian, 100 MB: 40 views of 280 points. A step on it takes a few seconds."""
+SMALL_COVERAGE = 0.4
+"""Share of a picture's width or height that all views' points span, below which a warning says so."""
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """What a user may state.
+
+    length: (mm, 1-sigma mm) of the target's longest row of points, first to last; without it the scale is unverified.
+    rigid: the target's sheet neither stretches nor bows (glass, metal). baseline_mm, distance_mm: entered to be
+    checked against. warm_up_minutes: how long the rig had been on.
+    """
+
+    length: tuple[float, float] | None = None
+    rigid: bool = False
+    baseline_mm: float | None = None
+    distance_mm: float | None = None
+    warm_up_minutes: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A calibrated rig and how good it is. held_out: see `held_out_errors`."""
+
+    target: Target
+    options: SolveOptions
+    problem: Problem
+    adjusted: Adjusted
+    facing: Facing
+    held_out: Array
+    epipolar: tuple[Array, ...]
+    """per view (N,) px in the projector"""
+    left_out: tuple[LeftOut, ...]
+    warnings: tuple[str, ...]
+    response: dict[str, Any] | None = None
+    created: tuple[str, str] = ("", "")
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def state(self) -> State:
+        """The rig."""
+        return self.adjusted.state
+
+    @property
+    def geometry(self) -> Calibration:
+        """The rig as scans take it."""
+        s = self.state
+        return Calibration(s.camera, s.projector, s.rotation, s.translation)
+
+
+def solve(
+    target: Target,
+    observations: Sequence[Observation],
+    options: SolveOptions | None = None,
+    left_out: Sequence[LeftOut] = (),
+    progress: Progress | None = None,
+    *,
+    hold_out: bool = True,
+) -> Solution:
+    """Calibrate. hold_out: leave every view out in turn, which takes as long as the rest.
+
+    Raises:
+        CalibrationError: too few usable views, or a result that cannot be; with the likely cause.
+    """
+    options = options or SolveOptions()
+    tell = progress or (lambda _: None)
+    out = list(left_out)
+    observations = _of_one_rig(observations, out)
+    _require_views(target, observations, out)
+    views = [o.view for o in observations]
+    facing, odd = check_facing(views)
+    views = _without(views, odd, out)
+    camera_size, projector_size = observations[0].camera_size, observations[0].projector_size
+    check_motion(views, camera_size, target)
+    tell("adjusting")
+    views = thinned(views)
+    begun = start(target, views, camera_size, projector_size)
+    views = _without(views, begun.left_out, out)
+    problem = Problem(
+        target,
+        camera_size,
+        projector_size,
+        tuple(views),
+        _priors(options, target),
+        _length(options, target),
+    )
+    problem, adjusted = _without_bad_views(problem, begun.state, out)
+    check_state(problem, adjusted)
+    warnings = check_stated(problem, adjusted.state, options.baseline_mm, options.distance_mm)
+    tell("leaving views out")
+    held_out = held_out_errors(problem, adjusted) if hold_out else np.full(len(problem.views), np.nan)
+    used = {view.name for view in problem.views}
+    taken = sorted(o.created for o in observations if o.created and o.view.name in used)
+    solution = Solution(
+        target,
+        options,
+        problem,
+        adjusted,
+        facing,
+        held_out,
+        epipolar_errors(problem, adjusted.state),
+        tuple(out),
+        (),
+        observations[0].response,
+        (taken[0], taken[-1]) if taken else ("", ""),
+    )
+    return replace(solution, warnings=tuple(warnings + _warnings(solution)))
+
+
+def epipolar_errors(problem: Problem, state: State) -> tuple[Array, ...]:
+    """Per view (N,) px: how far each projector point lies from the line on which its camera ray is seen."""
+    rig = Calibration(state.camera, state.projector, state.rotation, state.translation)
+    errors = []
+    for view, pose in zip(problem.views, state.poses, strict=True):
+        rays = np.column_stack((rig.camera.normalised(view.camera), np.ones(len(view.ids))))
+        depth = (problem.target.points[view.ids] @ rotation_of(pose[:3]).T + pose[3:])[:, 2:]
+        here = rig.projector.project(rig.to_projector(rays * depth))
+        there = rig.projector.project(rig.to_projector(rays * depth * 1.01))
+        along = (there - here) / np.linalg.norm(there - here, axis=1, keepdims=True)
+        off = view.projector - here
+        errors.append(off[:, 0] * along[:, 1] - off[:, 1] * along[:, 0])
+    return tuple(errors)
+
+
+def thinned(views: Sequence[View]) -> list[View]:
+    """Views with every second, third ... point only, where all of them would make too large an adjustment."""
+    parameters = POSES + 6 * len(views)
+    entries = 4 * sum(len(view.ids) for view in views) * parameters
+    step = int(np.ceil(entries / MOST_ENTRIES))
+    return [view.only(np.arange(len(view.ids)) % step == 0) if step > 1 else view for view in views]
+
+
+def _of_one_rig(observations: Sequence[Observation], out: list[LeftOut]) -> list[Observation]:
+    """The observations whose pictures have the sizes that most have."""
+    sizes = [(o.camera_size, o.projector_size) for o in observations]
+    if not sizes:
+        return []
+    common = max(set(sizes), key=sizes.count)
+    kept = []
+    for observation, size in zip(observations, sizes, strict=True):
+        if size == common:
+            kept.append(observation)
+        else:
+            out.append(
+                LeftOut(
+                    observation.view.name,
+                    "its pictures have another size than most: another camera, region or projector",
+                )
+            )
+    return kept
+
+
+def _require_views(target: Target, observations: Sequence[Observation], out: Sequence[LeftOut]) -> None:
+    needed = FEWEST_VIEWS if target.flat else 1
+    if len(observations) >= needed:
+        return
+    every = len(observations) + len(out)
+    reasons = sorted({o.reason for o in out}, key=lambda r: -sum(o.reason == r for o in out))
+    message = f"{len(observations)} of {every} captures can be used, {needed} are needed"
+    if out and all(o.out_of_step for o in out):
+        raise CalibrationError(
+            f"{message}: frames and patterns are out of step ({out[0].name}: {out[0].reason})",
+            hint="look at a capture with fringed audit; measure the projector's latency, then capture again",
+        )
+    if reasons:
+        message += ". " + "; ".join(f"{sum(o.reason == r for o in out)} x {r}" for r in reasons[:4])
+    raise CalibrationError(
+        message, hint=f"the target looked for is {target.spec}; capture it in 10 to 20 poses, both axes"
+    )
+
+
+def _without(views: Sequence[View], bad: Mapping[int, str], out: list[LeftOut]) -> list[View]:
+    out += [LeftOut(views[k].name, why) for k, why in sorted(bad.items())]
+    return [view for k, view in enumerate(views) if k not in bad]
+
+
+def _priors(options: SolveOptions, target: Target) -> Priors:
+    if not options.rigid and target.flat:
+        return Priors()
+    return Priors(sheet_scale=1e-7, sheet_bow=1e-7)
+
+
+def _length(options: SolveOptions, target: Target) -> Length | None:
+    if options.length is None:
+        return None
+    mm, sigma = options.length
+    nominal = target.longest_mm
+    if abs(mm / nominal - 1) > 0.05:
+        raise CalibrationError(
+            f"the stated length of {mm:g} mm does not fit the target: from the first to the last of its longest row "
+            f"are {nominal:g} mm",
+            hint="measure between the outermost points of the longest row, or correct the target's spacing",
+        )
+    return Length(*target.longest, mm, max(sigma, 1e-6))
+
+
+def _adjusted(problem: Problem, state: State) -> tuple[Problem, Adjusted]:
+    """The adjustment; discs' centres are corrected for perspective and it is done again."""
+    try:
+        adjusted = adjust(problem, state)
+        seen = problem
+        for _ in range(DISC_ROUNDS if problem.target.discs else 0):
+            problem = replace(seen, views=tuple(_centred(seen, adjusted.state, k) for k in range(len(seen.views))))
+            adjusted = adjust(problem, adjusted.state)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise CalibrationError(
+            f"no rig fits these points: the adjustment ends in nothing ({error})", hint=MISMATCH
+        ) from error
+    return problem, adjusted
+
+
+def _centred(problem: Problem, state: State, k: int) -> View:
+    """A view of discs with each point moved from its ellipse's centre to where the disc's centre is seen."""
+    view, target = problem.views[k], problem.target
+    sheet, _ = sheet_points(target, state.sheet)
+    rotation = rotation_of(state.poses[k, :3])
+    centres = sheet[view.ids] @ rotation.T + state.poses[k, 3:]
+    normals = np.tile((0.0, 0.0, 1.0), (len(centres), 1)) if target.flat else target.normals
+    if normals is None:
+        return view
+    turned = (normals if target.flat else normals[view.ids]) @ rotation.T
+    moved = eccentricity(centres, turned, target.diameter_mm / 2, state.camera.project)
+    return replace(view, camera=view.camera - moved, projector=view.projector - (view.slope @ moved[..., None])[..., 0])
+
+
+def _without_bad_views(problem: Problem, state: State, out: list[LeftOut]) -> tuple[Problem, Adjusted]:
+    """Adjust; leave out the worst view while one contradicts the others, and adjust again."""
+    seen = problem
+    while True:
+        problem, adjusted = _adjusted(seen, state)
+        worst = _worst_view(adjusted) if problem.target.flat else None
+        if worst is None or len(seen.views) <= FEWEST_VIEWS:
+            return problem, adjusted
+        k, why = worst
+        out.append(LeftOut(seen.views[k].name, why))
+        keep = [i for i in range(len(seen.views)) if i != k]
+        seen = replace(seen, views=tuple(seen.views[i] for i in keep))
+        state = replace(adjusted.state, poses=adjusted.state.poses[keep])
+
+
+def _worst_view(adjusted: Adjusted) -> tuple[int, str] | None:
+    found = None
+    for side, residuals in (("camera", adjusted.camera_residuals), ("projector", adjusted.projector_residuals)):
+        rms = np.array([np.sqrt((r**2).sum(axis=1).mean()) for r in residuals])
+        k = int(np.argmax(rms))
+        others = float(np.median(np.delete(rms, k))) if len(rms) > 1 else rms[k]
+        over = rms[k] / max(BAD_VIEW * others, BAD_VIEW_PX)
+        if over > 1 and (found is None or over > found[2]):
+            found = (
+                k,
+                f"contradicts the other views: {rms[k]:.2f} px in the {side} against their {others:.2f} px",
+                over,
+            )
+    return found and found[:2]
+
+
+def _warnings(solution: Solution) -> list[str]:
+    problem, adjusted = solution.problem, solution.adjusted
+    warnings = []
+    if solution.facing.words is not None:
+        warnings.append(solution.facing.words)
+    if problem.target.flat and len(problem.views) < FEW_VIEWS:
+        warnings.append(f"{len(problem.views)} views: 10 to 20 make a calibration that can be judged")
+    for side, size, points in (
+        ("camera", problem.camera_size, np.concatenate([v.camera for v in problem.views])),
+        ("projector", problem.projector_size, np.concatenate([v.projector for v in problem.views])),
+    ):
+        span = (points.max(axis=0) - points.min(axis=0)) / size
+        if span.min() < SMALL_COVERAGE:
+            warnings.append(
+                f"the poses cover {span[0]:.0%} x {span[1]:.0%} of the {side}'s picture: "
+                "what lies outside is extrapolated"
+            )
+    dropped = sum(int((~k).sum()) for k in adjusted.kept)
+    total = sum(len(k) for k in adjusted.kept)
+    if dropped > 0.1 * total:
+        warnings.append(f"{dropped} of {total} points were left out as outliers")
+    stretch = adjusted.state.sheet[:2] - 1
+    if solution.options.length is None and np.abs(stretch).max() > 2 * problem.priors.sheet_scale:
+        warnings.append(
+            f"the sheet seems stretched by {stretch[0]:+.2%} along x and {stretch[1]:+.2%} along y: "
+            "measure it (--length)"
+        )
+    return warnings
+
+
+def sigmas(adjusted: Adjusted) -> Mapping[str, Array]:
+    """1-sigma of the parameters, by group: camera, projector (9,), rotation, translation (3,), sheet (3,)."""
+    spread = np.sqrt(np.clip(np.diag(adjusted.covariance), 0, None))
+    groups = {"camera": CAMERA, "projector": PROJECTOR, "rotation": TURN, "translation": SHIFT, "sheet": SHEET}
+    return {name: spread[part] for name, part in groups.items()}

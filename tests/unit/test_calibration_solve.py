@@ -1,0 +1,282 @@
+"""The adjustment on points made by geometry: what it finds, what it states, and what it refuses and why."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from scanner.calibration.adjustment import Equations, adjust
+from scanner.calibration.calibration_file import as_text, calibration_dict
+from scanner.calibration.lens_slopes import lens_numbers
+from scanner.calibration.observe import LeftOut, Observation
+from scanner.calibration.problem import POSES, Problem, State, View
+from scanner.calibration.solve import Solution, SolveOptions, sigmas, solve, thinned
+from scanner.calibration.targets import parse_target
+from scanner.errors import CalibrationError
+from scanner.geometry import Calibration, calibration_from_dict
+from tests.unit.calibration_bench import TARGET, made_up_rig, observations, poses, view_of
+
+RIG = made_up_rig()
+LENGTH = SolveOptions(length=(TARGET.longest_mm, 0.01))
+
+
+def calibrate(*arguments: object) -> Solution:
+    return solve(*arguments, hold_out=False)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def solution() -> Solution:
+    return solve(TARGET, observations(RIG, poses()), LENGTH)
+
+
+def test_finds_the_rig(solution: Solution) -> None:
+    state = solution.state
+    for found, true in ((state.camera, RIG.camera), (state.projector, RIG.projector)):
+        assert np.diag(found.matrix)[:2] == pytest.approx(np.diag(true.matrix)[:2], rel=5e-4)
+        assert found.matrix[:2, 2] == pytest.approx(true.matrix[:2, 2], abs=2.0)
+    assert state.translation == pytest.approx(RIG.translation, abs=0.3)
+    assert solution.left_out == ()
+    assert solution.warnings == ()
+
+
+def test_noise_is_recovered_from_the_residuals(solution: Solution) -> None:
+    assert solution.adjusted.sigma_camera == pytest.approx(0.02, rel=0.1)
+    assert solution.adjusted.projector_factor == pytest.approx(1.0, rel=0.1)
+
+
+def test_errors_lie_within_stated_sigmas() -> None:
+    within = []
+    for seed in range(5):
+        found = calibrate(TARGET, observations(RIG, poses(8, seed=seed), seed=seed), LENGTH)
+        spread = sigmas(found.adjusted)
+        for side, lens, true in (
+            ("camera", found.state.camera, RIG.camera),
+            ("projector", found.state.projector, RIG.projector),
+        ):
+            within.append(np.abs(lens_numbers(lens) - lens_numbers(true))[:4] / spread[side][:4])
+        within.append(np.abs(found.state.translation - RIG.translation) / spread["translation"])
+    ratios = np.concatenate(within)
+    # 55 errors, correlated in threes: 95 % are expected within two sigmas, and they must not be all far within.
+    assert np.mean(ratios < 2) > 0.85
+    assert np.mean(ratios < 0.5) < 0.7
+
+
+def test_held_out_views_are_predicted(solution: Solution) -> None:
+    assert np.isfinite(solution.held_out).all()
+    assert np.median(solution.held_out) < 0.02
+
+
+def test_jacobian_is_that_of_the_residuals() -> None:
+    views = tuple(view_of(RIG, pose, f"v{k}") for k, pose in enumerate(poses(3)))
+    problem = Problem(TARGET, RIG.camera.size, RIG.projector.size, views)
+    state = State(RIG.camera, RIG.projector, RIG.rotation, RIG.translation, np.array([1.001, 0.999, 0.4]), poses(3))
+    equations, x = Equations(problem, (0.02, 1.0)), state.vector()
+    dense = equations.evaluate(x)[1]
+    rows = slice(0, sum(4 * len(v.ids) for v in views))
+    for k in range(POSES + 18):
+        step = 1e-6 * max(abs(x[k]), 1e-2)
+        ahead, behind = x.copy(), x.copy()
+        ahead[k] += step
+        behind[k] -= step
+        numeric = (equations.evaluate(ahead)[0] - equations.evaluate(behind)[0])[rows] / (2 * step)
+        assert np.abs(dense[rows, k] - numeric).max() < 1e-4 * max(np.abs(numeric).max(), 1e-9), k
+
+
+def test_large_problems_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = [one.view for one in observations(RIG, poses(5))]
+    assert all(len(view.ids) == 54 for view in thinned(views))
+    monkeypatch.setattr("scanner.calibration.solve.MOST_ENTRIES", 4 * 5 * 27 * 57)
+    assert [len(view.ids) for view in thinned(views)] == [27] * 5
+
+
+def test_stretched_sheet_is_found() -> None:
+    stretched = observations(RIG, poses(), sheet=(1.0, 1.002, 1.0))
+    found = calibrate(TARGET, stretched, LENGTH)
+    assert found.state.sheet[1] == pytest.approx(1.002, abs=2e-4)
+    assert found.state.translation == pytest.approx(RIG.translation, abs=0.3)
+
+
+def test_scale_is_the_stated_length_or_unverified(solution: Solution) -> None:
+    plain = calibration_dict(calibrate(TARGET, observations(RIG, poses(6)), SolveOptions(rigid=True)))
+    assert plain["scale"] == "unverified"
+    stated = calibration_dict(solution)
+    assert stated["scale"] == {"reference_mm": 240.0, "sigma_mm": 0.01}
+    longer = calibrate(TARGET, observations(RIG, poses(6)), SolveOptions(length=(240.48, 0.01)))
+    assert np.linalg.norm(longer.state.translation) == pytest.approx(1.002 * np.linalg.norm(RIG.translation), rel=5e-4)
+    # A scale that nobody verified is a thousandth unsure, and the translation says so.
+    unverified = calibrate(TARGET, observations(RIG, poses(6)))
+    assert sigmas(unverified.adjusted)["translation"][0] > 5 * sigmas(solution.adjusted)["translation"][0]
+
+
+def test_file_is_read_back_and_its_id_is_its_content(solution: Solution) -> None:
+    content = calibration_dict(solution, created="2026-01-01T00:00:00Z")
+    read = calibration_from_dict(content)
+    assert read.translation == pytest.approx(solution.state.translation)
+    assert content["id"] == calibration_dict(solution, created="2027-01-01T00:00:00Z")["id"]
+    changed = replace(solution, response={"gamma": 2.2})
+    assert calibration_dict(changed)["id"] != content["id"]
+    assert calibration_dict(changed)["response"] == {"projector": {"gamma": 2.2}, "camera": None}
+    assert len(content["covariance"]["matrix"]) == len(content["covariance"]["parameters"]) == 24
+    assert [view["name"] for view in content["residuals"]["views"]] == [f"pose{k:02d}" for k in range(12)]
+    assert "[1280, 1024]" in as_text(content)
+
+
+def test_bad_views_are_named_and_left_out() -> None:
+    good = observations(RIG, poses())
+    moved = replace(good[3].view, projector=good[3].view.projector + np.array([3.0, 0.0]))
+    turned = replace(
+        good[7].view, camera=good[7].view.camera[::-1].copy(), projector=good[7].view.projector[::-1].copy()
+    )
+    mixed = list(good)
+    mixed[3] = Observation(moved, *_sizes(good[3]))
+    mixed[7] = Observation(turned, *_sizes(good[7]))
+    found = calibrate(TARGET, mixed, LENGTH, [LeftOut("dark", "no chessboard in the picture")])
+    names = {one.name for one in found.left_out}
+    # A board turned by half is the same board: only the moved one contradicts the others.
+    assert names == {"dark", "pose03"}
+    assert np.linalg.norm(found.state.translation - RIG.translation) < 0.5
+
+
+def test_other_sizes_are_left_out() -> None:
+    mixed = observations(RIG, poses())
+    mixed[0] = replace(mixed[0], camera_size=(640, 480))
+    found = calibrate(TARGET, mixed, LENGTH)
+    assert [one.name for one in found.left_out] == ["pose00"]
+
+
+def test_outlying_points_do_not_matter() -> None:
+    spoilt = observations(RIG, poses())
+    for k in (0, 5):
+        view = spoilt[k].view
+        camera = view.camera.copy()
+        camera[::11] += 4.0
+        spoilt[k] = Observation(replace(view, camera=camera), *_sizes(spoilt[k]))
+    found = calibrate(TARGET, spoilt, LENGTH)
+    assert found.state.translation == pytest.approx(RIG.translation, abs=0.4)
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_turned_projectors_are_accepted_and_named(degrees: int) -> None:
+    rig = _projector_seen(
+        RIG,
+        lambda p, w, h: {90: (h - 1 - p[:, 1], p[:, 0]), 180: (w - 1 - p[:, 0], h - 1 - p[:, 1])}.get(
+            degrees, (p[:, 1], w - 1 - p[:, 0])
+        ),
+        swap=degrees != 180,
+    )
+    found = calibrate(TARGET, rig, LENGTH)
+    assert any("upside down" in w if degrees == 180 else "turned by" in w for w in found.warnings)
+    assert np.linalg.norm(found.state.translation) == pytest.approx(np.linalg.norm(RIG.translation), abs=0.3)
+
+
+def test_mirrored_and_swapped_are_refused_by_name() -> None:
+    for change, word, setting in (
+        (lambda p, w, h: (w - 1 - p[:, 0], p[:, 1]), "mirrored left to right", "mirror = true under"),
+        (lambda p, w, h: (p[:, 0], h - 1 - p[:, 1]), "mirrored top to bottom", "mirror = true and rotate = 180"),
+    ):
+        with pytest.raises(CalibrationError, match=word) as refused:
+            calibrate(TARGET, _projector_seen(RIG, change), LENGTH)
+        assert setting in str(refused.value.hint)
+    with pytest.raises(CalibrationError, match="rows and columns are exchanged"):
+        calibrate(TARGET, _projector_seen(RIG, lambda p, w, h: (p[:, 1], p[:, 0]), swap=True), LENGTH)
+
+
+def test_wrong_square_size_is_named_by_a_stated_baseline() -> None:
+    wrong = parse_target("chessboard:9x6:25")
+    true = float(np.linalg.norm(RIG.translation))
+    views = observations(RIG, poses(6))
+    with pytest.raises(CalibrationError, match="target's size is probably stated wrong") as refused:
+        calibrate(wrong, views, SolveOptions(baseline_mm=true))
+    assert "30.0" in str(refused.value.hint)
+    with pytest.raises(CalibrationError, match="working distance"):
+        calibrate(wrong, views, SolveOptions(distance_mm=700.0))
+    slightly = calibrate(TARGET, views, SolveOptions(length=(240.0, 0.01), baseline_mm=true * 1.08))
+    assert any("were entered" in warning for warning in slightly.warnings)
+    with pytest.raises(CalibrationError, match="does not fit the target"):
+        calibrate(wrong, views, SolveOptions(length=(240.0, 0.1)))
+
+
+def test_target_that_did_not_move_is_named() -> None:
+    still = np.repeat(poses(1), 8, axis=0)
+    with pytest.raises(CalibrationError, match="did not move"):
+        calibrate(TARGET, observations(RIG, still), LENGTH)
+    two = np.concatenate((np.repeat(poses(2)[:1], 4, axis=0), np.repeat(poses(2)[1:], 4, axis=0)))
+    with pytest.raises(CalibrationError, match="2 different poses are too few"):
+        calibrate(TARGET, observations(RIG, two), LENGTH)
+
+
+def test_poses_without_depth_or_tilt_are_refused() -> None:
+    flat = poses(8, tilt_deg=0.0, depth=(700.0, 700.0))
+    flat[:, :2] = 0.0
+    with pytest.raises(CalibrationError) as refused:
+        calibrate(TARGET, observations(RIG, flat), LENGTH)
+    assert "tilt" in str(refused.value.hint) or "plane" in str(refused.value)
+
+
+def test_too_few_captures_say_why() -> None:
+    few = observations(RIG, poses(2))
+    out = [LeftOut("a", "no chessboard"), LeftOut("b", "no chessboard"), LeftOut("c", "too dark")]
+    with pytest.raises(CalibrationError, match=r"2 of 5 captures can be used, 3 are needed. 2 x no chessboard"):
+        calibrate(TARGET, few, LENGTH, out)
+    late = [LeftOut(name, "frames out of step: frames 3, 4", out_of_step=True) for name in "abc"]
+    with pytest.raises(CalibrationError, match="out of step"):
+        calibrate(TARGET, [], LENGTH, late)
+
+
+def test_wrong_columns_and_rows_fit_no_rig() -> None:
+    with pytest.raises(CalibrationError, match=r"no rig fits these points|focal length"):
+        calibrate(parse_target("chessboard:6x9:30"), observations(RIG, poses(4)), LENGTH)
+
+
+def test_measured_independently_without_slopes() -> None:
+    plain = []
+    for k, pose in enumerate(poses()):
+        view = view_of(RIG, pose, f"p{k}", noise=(0.0, 0.0))
+        generator = np.random.default_rng(k)
+        camera, projector = (a + generator.normal(0, 0.05, a.shape) for a in (view.camera, view.projector))
+        free = View(view.name, view.ids, camera, projector, np.full(camera.shape, 0.1), np.zeros_like(view.slope))
+        plain.append(Observation(free, RIG.camera.size, RIG.projector.size))
+    found = calibrate(TARGET, plain, LENGTH)
+    assert found.adjusted.sigma_camera == pytest.approx(0.05, rel=0.15)
+    assert found.adjusted.projector_factor == pytest.approx(0.5, rel=0.15)
+
+
+def test_adjustment_holds_what_is_fixed() -> None:
+    views = tuple(view_of(RIG, pose, f"v{k}") for k, pose in enumerate(poses(6)))
+    state = State(RIG.camera, RIG.projector, RIG.rotation, RIG.translation, np.array([1.0, 1.0, 0.0]), poses(6))
+    held = adjust(Problem(TARGET, RIG.camera.size, RIG.projector.size, views, fixed=(0, 1, 24, 25, 26)), state)
+    assert held.state.camera.matrix[0, 0] == RIG.camera.matrix[0, 0]
+    assert held.covariance[0, 0] == 0
+    assert held.covariance[2, 2] > 0
+
+
+def _sizes(observation: Observation) -> tuple[tuple[int, int], tuple[int, int]]:
+    return observation.camera_size, observation.projector_size
+
+
+def _projector_seen(rig: Calibration, change, *, swap: bool = False) -> list[Observation]:
+    """The views with the projector's coordinates changed as a turned, mirrored or mistaken one would."""
+    width, height = rig.projector.size
+    found = []
+    for one in observations(rig, poses(6)):
+        view = one.view
+        moved = np.column_stack(change(view.projector, width, height))
+        corner = np.column_stack(change(np.zeros((1, 2)), width, height))
+        turn = np.stack(
+            [(np.column_stack(change(np.eye(2)[k][None], width, height)) - corner)[0] for k in range(2)], axis=-1
+        )
+        new = replace(view, projector=moved, slope=turn @ view.slope)
+        found.append(Observation(new, one.camera_size, (height, width) if swap else (width, height)))
+    return found
+
+
+def test_rodrigues_of_a_board_turned_by_half() -> None:
+    every = poses()
+    for pose in every:
+        turned = np.asarray(cv2.Rodrigues(pose[:3])[0]) @ np.diag([-1.0, -1.0, 1.0])
+        pose[:3] = cv2.Rodrigues(turned)[0].ravel()
+    found = calibrate(TARGET, observations(RIG, every), LENGTH)
+    assert found.state.translation == pytest.approx(RIG.translation, abs=0.3)
