@@ -40,6 +40,12 @@ tables: setup ## the dissertation's tables on the simulated rig, into docs/; ARG
 docs: setup ## write the generated pages of the documentation anew
 	@$(bin)/python docs/generate.py
 
+install: ## as a service, for root: PREFIX=/usr/local, DESTDIR= for packagers
+	@setup/install-system.sh
+
+uninstall: ## undo install; rig file, captures and scans are kept
+	@setup/install-system.sh --remove
+
 clean: ## remove everything that set-up and tests made; scans are kept
 	rm -rf .venv .setup .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache build dist *.egg-info
 	find scanner drivers service tests bench docs -name __pycache__ -prune -exec rm -rf {} +

@@ -44,8 +44,9 @@ from service.devices_link import DevicesLink
 from service.jobs import JobStore
 from service.live import Live
 from service.logs import start_logging
+from service.notify import Notifier
 from service.pipeline import Pipeline
-from service.sockets import bound, refuse_files, refuse_taken, remove_sockets, send_now
+from service.sockets import bound, keep_from_clients, refuse_files, refuse_taken, remove_sockets, send_now
 from service.spool import Limits, Spool
 from service.worker_pool import WorkerPool
 
@@ -80,6 +81,7 @@ class Daemon:
         self._worker_silence_s = worker_silence_s
         self._number = 0
         self._stopped = asyncio.Event()
+        self._notifier = Notifier()
         self._calls: set[asyncio.Task[None]] = set()
 
     async def run(self, ready: asyncio.Event | None = None) -> None:
@@ -115,6 +117,7 @@ class Daemon:
         self._control = bound(context, zmq.ROUTER, self._endpoints.control)
         self._events = bound(context, zmq.XPUB, self._endpoints.events)
         router = bound(context, zmq.ROUTER, self._endpoints.worker)
+        keep_from_clients(self._endpoints.worker)
         rig = self._config.model_dump(mode="json")
         devices = DevicesLink(rig, self.publish, inherit=[lock], silence_s=self._devices_silence_s)
         command_line = ("--serve", self._endpoints.worker)
@@ -128,6 +131,8 @@ class Daemon:
         workers.start(self._config.daemon.workers)
         opening = asyncio.create_task(_open_early(devices))
         pipeline.start(live.recover)
+        feeding = asyncio.create_task(self._notifier.feed(lambda: devices.answers))
+        self._notifier.ready(f"serving {self._endpoints.control}")
         if ready is not None:
             ready.set()
         _log.info("serving %s", self._endpoints.control)
@@ -135,11 +140,13 @@ class Daemon:
             await self._stopped.wait()
         finally:
             _log.info("ending")
+            self._notifier.ending()
             await live.close()
             await pipeline.close()
-            for task in (*serving, opening, *self._calls):
+            ended = (*serving, opening, feeding, *self._calls)
+            for task in ended:
                 task.cancel()
-            await asyncio.gather(*serving, opening, *self._calls, return_exceptions=True)
+            await asyncio.gather(*ended, return_exceptions=True)
             await asyncio.gather(workers.close(), devices.close())
 
     # --- sockets ------------------------------------------------------------------------------------------------

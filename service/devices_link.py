@@ -48,6 +48,9 @@ OPEN_S = 60.0
 SILENCE_S = 30.0
 """A scan says something with every frame; exposures last 10 s at most (`service.config`), twice that and a margin."""
 
+KILL_S = 10.0
+"""A process in an uninterruptible call of the kernel does not die when it is killed."""
+
 DISCOVER_S = 15.0
 _log = logging.getLogger(__name__)
 Publish = Callable[[str, str | None, Mapping[str, Any]], None]
@@ -83,11 +86,19 @@ class DevicesLink:
         self._reader: asyncio.Task[None] | None = None
         self._opened: asyncio.Future[Opened] | None = None
         self._scans: dict[str, asyncio.Queue[Report | None]] = {}
+        self._due: dict[str, float] = {}
+        """by job: when a devices process that says nothing must be gone, killing it included; the loop's time, s"""
         self._numbers = itertools.count(1)
         self._discoveries: dict[int, asyncio.Future[list[dict[str, Any]]]] = {}
         self._preview: Preview | None = None
         self.description: dict[str, Any] | None = None
         """camera and projector as opened; None while there are none"""
+
+    @property
+    def answers(self) -> bool:
+        """False where a process that is silent could not be killed in time: only a new daemon helps then."""
+        now = asyncio.get_running_loop().time()
+        return all(now < due for due in self._due.values())
 
     async def open(self) -> Opened:
         """Open the devices unless they are.
@@ -195,12 +206,15 @@ class DevicesLink:
                     listener.live(report)
 
     async def _next(self, job: str, patience_s: float) -> Report:
+        self._due[job] = asyncio.get_running_loop().time() + patience_s + KILL_S
         try:
             async with asyncio.timeout(patience_s):
                 report = await self._scans[job].get()
         except TimeoutError:
             await self._give_up()
             return self._lost(job, f"the devices process said nothing for {patience_s:g} s and was killed")
+        finally:
+            del self._due[job]
         return self._lost(job, "the devices process died") if report is None else report
 
     async def _until_closed(self, job: str) -> Ended:

@@ -51,6 +51,17 @@ def bound(context: zmq.asyncio.Context, kind: int, endpoint: str) -> zmq.asyncio
     return opened
 
 
+def keep_from_clients(endpoint: str) -> None:
+    """Give a socket to the daemon's own group, where the folder hands on the clients' (setgid, see systemd/).
+
+    Raises:
+        StorageError: it cannot be done.
+    """
+    path = Path(ipc_path(endpoint))
+    with storage_errors(path):
+        os.chown(path, -1, os.getegid())
+
+
 def refuse_files(endpoints: Iterable[str]) -> None:
     """Raise ConfigError where an endpoint names what is no socket: libzmq would delete it to bind there.
 
