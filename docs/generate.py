@@ -53,7 +53,14 @@ def pages() -> dict[Path, str]:
 
 def _commands() -> Iterator[str]:
     group: Any = typer.main.get_command(app)
-    for name, command in group.commands.items():
+    yield from _commands_of(group, "")
+
+
+def _commands_of(group: Any, before: str) -> Iterator[str]:
+    for name, command in ((before + name, command) for name, command in group.commands.items()):
+        if hasattr(command, "commands"):
+            yield from _commands_of(command, f"{name} ")
+            continue
         text, _, examples = inspect.cleandoc(command.help).partition("\b\nExamples:\n")
         positional = [p for p in command.params if p.param_type_name == "argument"]
         options = [p for p in command.params if p.param_type_name == "option"]

@@ -1,0 +1,15 @@
+"""`fringed calibrate`: the group of commands around a rig's calibration. Each stands in a file of its own."""
+
+from __future__ import annotations
+
+import typer
+
+from service.commands import calibrate_solve, calibrate_target
+
+group = typer.Typer(
+    help="Calibrate a rig: print a target, solve from captures of it, check the result.",
+    rich_markup_mode=None,
+    no_args_is_help=True,
+)
+group.command("solve")(calibrate_solve.solve)
+group.command("target")(calibrate_target.target)

@@ -1,0 +1,179 @@
+"""`fringed calibrate solve`: captures of a target in several poses to a calibration file. Needs no device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.commands.options import AsJson, output_path
+from service.terminal import print_error, print_facts, print_json, print_table, progress_lines
+
+if TYPE_CHECKING:
+    from scanner.calibration.solve import Solution
+
+TARGET_HELP = (
+    "chessboard:9x6:30 (inner corners, mm), charuco:10x7:30[:MARKER[:DICT]] (squares), circles:COLSxROWS:MM[:DIAM], "
+    "acircles:COLSxROWS:MM[:DIAM], wedge:FILE."
+)
+
+
+Replace = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
+
+
+def solve(
+    captures: Annotated[
+        list[Path], typer.Argument(metavar="CAPTURE...", help="Capture folders, scans' folders, or folders of those.")
+    ],
+    target: Annotated[str, typer.Option(metavar="TARGET", help=TARGET_HELP)],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE", parser=output_path, help="Calibration file to write.")
+    ],
+    length: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MM[:SIGMA]",
+            help="Measured length of the target's longest row of points, end to end, and its 1-sigma (0.1 mm).",
+        ),
+    ] = None,
+    rigid: Annotated[
+        bool, typer.Option("--rigid", help="The target is glass or metal: no stretch and no bow are fitted.")
+    ] = False,
+    baseline: Annotated[
+        float | None,
+        typer.Option(
+            metavar="MM", min=1, max=1e5, help="Distance from lens to lens by a rule, to check the result by."
+        ),
+    ] = None,
+    distance: Annotated[
+        float | None,
+        typer.Option(metavar="MM", min=1, max=1e6, help="Distance of the targets by a rule, to check the result by."),
+    ] = None,
+    warm_up: Annotated[
+        float | None, typer.Option(metavar="MINUTES", min=0, max=1e5, help="How long the rig had been on; is recorded.")
+    ] = None,
+    picture: Annotated[
+        bool, typer.Option("--picture/--no-picture", help="Draw residuals and coverage to FILE's name with .png.")
+    ] = True,
+    force: Replace = False,
+    as_json: AsJson = False,
+) -> int:
+    """Calibrate camera and projector from captures of a target, both axes in each.
+
+    Captures that cannot serve are left out and named. A result that cannot be is refused with its likely cause, and no
+    file is written.
+
+    \b
+    Examples:
+      fringed calibrate solve poses/ --target chessboard:9x6:30 -o rig.json
+      fringed calibrate solve p1 p2 p3 p4 --target charuco:10x7:30 --length 240.1:0.05 -o rig.json
+      fringed calibrate solve poses/ --target chessboard:9x6:30 --baseline 240 -o rig.json --json
+    """
+    stated = None if length is None else _length(length)
+    drawing = output.with_suffix(".png") if picture else None
+    if not force:
+        for path in (output, drawing):
+            if path is not None and path.exists():
+                raise typer.BadParameter(f"-o: {path} exists; --force replaces it")
+    with progress_lines() as lines:
+        lines.stage("opening captures")
+        from scanner.calibration.calibration_file import as_text, calibration_dict  # noqa: PLC0415
+        from scanner.calibration.observe import find_captures, observe  # noqa: PLC0415
+        from scanner.calibration.solve import SolveOptions  # noqa: PLC0415
+        from scanner.calibration.solve import solve as solve_rig  # noqa: PLC0415
+        from scanner.calibration.targets import parse_target  # noqa: PLC0415
+        from scanner.storage import replace_file  # noqa: PLC0415
+
+        looked_for = parse_target(target)
+        paths = find_captures(captures)
+        lines.stage("looking for the target", len(paths))
+        observations, left_out = observe(
+            paths, looked_for, lambda done, total: lines.advance(done, total, f"{done} of {total} captures")
+        )
+        options = SolveOptions(stated, rigid, baseline, distance, warm_up)
+        solution = solve_rig(looked_for, observations, options, left_out, lines.stage)
+        content = calibration_dict(solution)
+        lines.stage("writing")
+        if drawing is not None:
+            from scanner.calibration.pictures import draw  # noqa: PLC0415
+
+            replace_file(drawing, draw(solution))
+        replace_file(output, as_text(content).encode())
+    if as_json:
+        print_json(_document(solution, content, output, drawing))
+    else:
+        _show(solution, content, output, drawing)
+        for one in solution.left_out:
+            print_error(f"left out {one.name}: {one.reason}", label="warning")
+    for warning in solution.warnings:
+        print_error(warning, label="warning")
+    return 0
+
+
+def _length(text: str) -> tuple[float, float]:
+    mm, colon, sigma = text.partition(":")
+    try:
+        values = float(mm), float(sigma) if colon else 0.1
+    except ValueError as error:
+        raise typer.BadParameter(f"--length: expected MM or MM:SIGMA, got {text!r}") from error
+    if not (0 < values[0] < 1e6 and 0 < values[1] < values[0]):
+        raise typer.BadParameter(f"--length: {text!r} is no length with its uncertainty")
+    return values
+
+
+def _document(solution: Solution, content: dict[str, Any], output: Path, drawing: Path | None) -> dict[str, Any]:
+    return {
+        "file": str(output),
+        "picture": drawing and str(drawing),
+        "calibration": content,
+        "views": content["residuals"]["views"],
+        "left_out": [{"name": one.name, "reason": one.reason} for one in solution.left_out],
+        "warnings": list(solution.warnings),
+    }
+
+
+def _show(solution: Solution, content: dict[str, Any], output: Path, drawing: Path | None) -> None:
+    residuals = content["residuals"]
+    header = ("view", "points", "outliers", "camera px", "projector px", "epipolar px", "held out px")
+    names = ("name", "points", "outliers", "camera_px", "projector_px", "epipolar_px", "held_out_px")
+    print_table("views", header, ([_cell(view[name]) for name in names] for view in residuals["views"]))
+    print_facts("calibration", _facts(solution, content, output, drawing))
+
+
+def _facts(
+    solution: Solution, content: dict[str, Any], output: Path, drawing: Path | None
+) -> Sequence[tuple[str, Any]]:
+    from scanner.calibration.solve import sigmas  # noqa: PLC0415
+
+    state, spread = solution.state, sigmas(solution.adjusted)
+    facts: list[tuple[str, Any]] = [("id", content["id"])]
+    for side, lens in (("camera", state.camera), ("projector", state.projector)):
+        m, s = lens.matrix, spread[side]
+        facts.append(
+            (
+                side,
+                f"focal {m[0, 0]:.2f} +- {s[0]:.2f}, {m[1, 1]:.2f} +- {s[1]:.2f} px; "
+                f"axis at {m[0, 2]:.2f} +- {s[2]:.2f}, {m[1, 2]:.2f} +- {s[3]:.2f} px",
+            )
+        )
+    shift, s = state.translation, spread["translation"]
+    facts.append(("translation", ", ".join(f"{v:.3f} +- {e:.3f}" for v, e in zip(shift, s, strict=True)) + " mm"))
+    residuals = content["residuals"]
+    for name in ("camera", "projector", "epipolar"):
+        facts.append((f"rms {name}", f"{residuals[f'{name}_px']:.4f} px"))
+    scale = content["scale"]
+    facts.append(
+        ("scale", "scale unverified: no length was stated (--length)")
+        if scale == "unverified"
+        else ("scale", f"rests on {scale['reference_mm']:g} +- {scale['sigma_mm']:g} mm")
+    )
+    facts.append(("file", output))
+    return facts if drawing is None else [*facts, ("picture", drawing)]
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4f}" if isinstance(value, float) else str(value)

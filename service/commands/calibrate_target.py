@@ -1,0 +1,70 @@
+"""`fringed calibrate target`: a calibration target as an SVG file to print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.commands.calibrate_solve import TARGET_HELP, Replace
+from service.commands.options import AsJson, output_path
+from service.terminal import print_facts, print_json
+
+
+def target(
+    spec: Annotated[str, typer.Argument(metavar="TARGET", help=TARGET_HELP)],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE", parser=output_path, help="SVG file to write.")
+    ],
+    grey: Annotated[
+        float,
+        typer.Option(
+            metavar="SHARE", min=0, max=0.8, help="Lightness of the dark parts, 0 .. 0.8; fringes show on grey."
+        ),
+    ] = 0.0,
+    force: Replace = False,
+    as_json: AsJson = False,
+) -> int:
+    """Draw a target to print at 100 %, with a ruler that shows whether it was.
+
+    Dark grey squares (--grey 0.35) keep the fringes visible on them, which helps the projector's half of the
+    calibration; markers are found on black best.
+
+    \b
+    Examples:
+      fringed calibrate target chessboard:9x6:30 -o board.svg --grey 0.35
+      fringed calibrate target charuco:10x7:30 -o board.svg
+      fringed calibrate target acircles:4x11:20 -o dots.svg
+    """
+    if output.suffix != ".svg":
+        raise typer.BadParameter(f"-o: expected a name that ends in .svg, got {str(output)!r}")
+    if output.exists() and not force:
+        raise typer.BadParameter(f"-o: {output} exists; --force replaces it")
+    from scanner.calibration.target_svg import target_svg  # noqa: PLC0415
+    from scanner.calibration.targets import parse_target  # noqa: PLC0415
+    from scanner.storage import replace_file  # noqa: PLC0415
+
+    chosen = parse_target(spec)
+    drawing = target_svg(chosen, grey)
+    replace_file(output, drawing.text.encode())
+    first, last = chosen.longest
+    facts = {
+        "file": str(output),
+        "paper_mm": [round(drawing.width_mm, 3), round(drawing.height_mm, 3)],
+        "ruler_mm": drawing.ruler_mm,
+        "length_mm": chosen.longest_mm,
+    }
+    if as_json:
+        print_json({**facts, "points": len(chosen.points), "between": [first, last]})
+        return 0
+    print_facts(
+        "target",
+        [
+            ("file", output),
+            ("paper", f"{drawing.width_mm:g} x {drawing.height_mm:g} mm; print at 100 %, no fitting to the page"),
+            ("check", f"the ruler must be {drawing.ruler_mm:g} mm long"),
+            ("measure", f"first to last point of the longest row, nominally {chosen.longest_mm:g} mm (--length)"),
+        ],
+    )
+    return 0

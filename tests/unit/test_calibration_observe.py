@@ -1,0 +1,161 @@
+"""From capture folders to a calibration file: what is looked at, what is left out and why, and the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.simulated.rigs import rig
+from drivers.simulated.targets import target_points, target_poses
+from scanner.calibration.observe import LeftOut, Observation, find_captures, observe, observe_capture
+from scanner.calibration.targets import parse_target
+from scanner.capture import CaptureHeader
+from scanner.errors import ConfigError
+from scanner.geometry import load_calibration
+from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
+from scanner.patterns.sequence import Precorrection
+from service.cli import main
+from tests.unit.simulated_bench import Bench
+
+SPEC = "chessboard:9x6:19"
+TARGET = parse_target(SPEC)
+PATTERN = PmpPattern(axes=("x", "y"), frequencies=(1.0, 8.0), shifts=(4, 4))
+
+
+def write_capture(
+    folder: Path, device: str, pattern: PmpPattern = PATTERN, frames: list[np.ndarray] | None = None
+) -> Path:
+    """One capture of a simulated scene, without stamps."""
+    bench = Bench(device)
+    c = bench.projector.capabilities
+    sequence = PatternSequence(ProjectorSize(c.width, c.height), pattern, precorrection=Precorrection(gamma=2.3))
+    taken = bench.captured([sequence.image(k) for k in range(len(sequence))]) if frames is None else frames
+    shown = np.stack(taken).astype(np.uint8)
+    folder.mkdir(parents=True)
+    np.save(folder / "frames.npy", shown)
+    header = CaptureHeader(sequence, CameraFormat(shown.shape[2], shown.shape[1], 8), created="2026-11-22T10:00:00Z")
+    (folder / "capture.json").write_text(json.dumps(header.as_dict()))
+    bench.camera.close()
+    bench.projector.close()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def poses(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six good captures, one that is out of step, one of a bare board, one of a single axis."""
+    folder = tmp_path_factory.mktemp("poses")
+    for k in range(0, 12, 2):
+        write_capture(folder / f"p{k:02d}" / "capture", f"quick/chessboard_poses?pose={k}&seed=2")
+    late = np.load(folder / "p00" / "capture" / "frames.npy")
+    late[[1, 2]] = late[[2, 1]]
+    write_capture(folder / "late", "quick/board", frames=list(late))
+    write_capture(folder / "bare", "quick/board")
+    write_capture(folder / "rows", "quick/board", PmpPattern(axes=("y",), frequencies=(1.0, 8.0), shifts=(4, 4)))
+    return folder
+
+
+def test_points_of_a_simulated_pose(poses: Path) -> None:
+    found = observe_capture(poses / "p04" / "capture", "p04", TARGET)
+    assert isinstance(found, Observation)
+    chosen = rig("quick")
+    pose = target_poses("chessboard_poses", chosen, 2)[4]
+    # The board looks the same upside down, and is read from its other corner here.
+    points = target_points("chessboard_poses", chosen)[::-1] @ pose.rotation.T + pose.translation
+    calibration = chosen.calibration
+    camera = calibration.camera.project(points)[found.view.ids]
+    projector = calibration.projector.project(calibration.to_projector(points))[found.view.ids]
+    assert len(found.view.ids) == 54
+    # Squares of 17 px: the corners are good to a thirtieth, the projector's pixel of the same point to a tenth.
+    assert np.sqrt(((found.view.camera - camera) ** 2).mean()) < 0.04
+    assert np.sqrt(((found.view.projector - projector) ** 2).mean()) < 0.1
+    assert found.response == {"gamma": 2.3}
+
+
+def test_what_cannot_serve_says_why(poses: Path) -> None:
+    paths = find_captures([poses])
+    assert len(paths) == 9
+    observations, left_out = observe(paths, TARGET)
+    assert [one.view.name for one in observations] == [f"p{k:02d}" for k in range(0, 12, 2)]
+    reasons = {one.name: one for one in left_out}
+    assert "no chessboard" in reasons["bare"].reason
+    assert "--axis xy" in reasons["rows"].reason
+    assert reasons["late"].out_of_step
+    assert "out of step" in reasons["late"].reason
+
+
+def test_damaged_captures_are_left_out(poses: Path, tmp_path: Path) -> None:
+    (tmp_path / "capture.json").write_text("{")
+    found = observe_capture(tmp_path, "broken", TARGET)
+    assert isinstance(found, LeftOut)
+    assert "not JSON" in found.reason
+    with pytest.raises(ConfigError, match="no such capture"):
+        find_captures([tmp_path / "missing"])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match="holds no capture"):
+        find_captures([tmp_path / "empty"])
+    assert find_captures([poses / "p00", poses / "p00" / "capture"]) == [poses / "p00" / "capture"]
+
+
+def test_command_writes_a_calibration(poses: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "rig.json"
+    words = ["calibrate", "solve", str(poses), "--target", SPEC, "--length", "152:0.01", "-o", str(file), "--json"]
+    assert main([*words, "--warm-up", "30"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    calibration = load_calibration(file)
+    true = rig("quick").calibration
+    assert calibration.id == document["calibration"]["id"] != ""
+    assert np.linalg.norm(calibration.translation - true.translation) < 2.0
+    assert calibration.phase_axis == "y"
+    assert {one["name"] for one in document["left_out"]} == {"late", "bare", "rows"}
+    assert len(document["views"]) == 6
+    assert all(view["held_out_px"] < 1.0 for view in document["views"])
+    content = json.loads(file.read_text())
+    assert content["warm_up"] == {
+        "minutes": 30.0,
+        "first_capture": "2026-11-22T10:00:00Z",
+        "last_capture": "2026-11-22T10:00:00Z",
+    }
+    assert content["response"]["projector"] == {"gamma": 2.3}
+    assert content["scale"] == {"reference_mm": 152.0, "sigma_mm": 0.01}
+    assert file.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    assert main(words) == 2
+    assert "exists" in capsys.readouterr().err
+
+
+def test_command_leaves_no_file_of_a_failed_solve(
+    poses: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "rig.json"
+    pair = [str(poses / "p00"), str(poses / "p02")]
+    assert main(["calibrate", "solve", *pair, "--target", SPEC, "-o", str(file)]) == 1
+    assert "2 of 2 captures can be used, 3 are needed" in capsys.readouterr().err
+    wrong = ["--target", "chessboard:9x6:30", "--baseline", "150"]
+    assert main(["calibrate", "solve", str(poses), *wrong, "-o", str(file)]) == 1
+    assert "squares (spacing) of 18.99" in capsys.readouterr().err
+    assert main(["calibrate", "solve", str(poses), "--target", "chess:1", "-o", str(file)]) == 1
+    assert main(["calibrate", "solve", str(poses), "--target", SPEC, "--length", "x", "-o", str(file)]) == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_command_shows_views_and_warnings(poses: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["calibrate", "solve", str(poses), "--target", SPEC, "-o", str(tmp_path / "rig.json"), "--no-picture"]
+    assert main(words) == 0
+    shown = capsys.readouterr()
+    assert "scale unverified" in shown.out
+    assert "p04" in shown.out
+    assert "left out late" in shown.err
+    assert not (tmp_path / "rig.png").exists()
+
+
+def test_command_draws_a_target(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "board.svg"
+    assert main(["calibrate", "target", "chessboard:9x6:30", "-o", str(file), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["paper_mm"] == [330.0, 262.0]
+    assert document["length_mm"] == 240.0
+    assert file.read_text().startswith("<?xml")
+    assert main(["calibrate", "target", "chessboard:9x6:30", "-o", str(tmp_path / "board.pdf")]) == 2
+    assert main(["calibrate", "target", "chessboard:9x6:30", "-o", str(file)]) == 2
