@@ -56,11 +56,17 @@ HEADINGS = [
 
 def take(device, pattern, precorrection=2.3):
     """One frame of a simulated world, and what there is to know about it."""
+    frames, sequence, *known = take_white(device, pattern, precorrection)
+    return frames[0], replace(sequence, white=None), *known
+
+
+def take_white(device, pattern, precorrection=2.3):
+    """The same with a frame under full light behind the pattern's: frames, sequence, camera, truth, calibration."""
     clock = VirtualClock()
     camera = open_camera("simulated", device, {}, clock)
     projector = open_projector("simulated", device, {}, clock)
     size = ProjectorSize(projector.capabilities.width, projector.capabilities.height)
-    sequence = PatternSequence(size, pattern, precorrection=Precorrection(gamma=precorrection))
+    sequence = PatternSequence(size, pattern, white=1, precorrection=Precorrection(gamma=precorrection))
     camera.apply(CameraSettings(exposure_ns=33_333_333))
     projector.load([sequence.image(0)])
     projector.show(0)
@@ -72,14 +78,14 @@ def take(device, pattern, precorrection=2.3):
     projector.show(0)
     clock.sleep_until(clock.now_ns() + 200_000_000)
     camera.trigger()
-    white = camera.pop(1_000_000_000).pixels
+    white = camera.pop(1_000_000_000).pixels.copy()
     truth, calibration = camera.truth(), camera.true_calibration()
     bright = white > max(DARK * np.percentile(white, 99), 1)
     truth = replace(truth, lit=truth.lit & bright)
     cap = camera.capabilities
     camera.close()
     projector.close()
-    return frame, sequence, CameraFormat(cap.width, cap.height, cap.bits), truth, calibration
+    return [frame, white], sequence, CameraFormat(cap.width, cap.height, cap.bits), truth, calibration
 
 
 def depth_per_step(truth, calibration, axis):
@@ -119,12 +125,22 @@ def recall(marked, true, lit, pitch, levels):
     return found.mean() if len(found) else np.nan
 
 
+def figures_of(values):
+    """Figures by their heading."""
+    return dict(zip((h for h in HEADINGS if h != "|"), values, strict=True))
+
+
 def measure(frame, sequence, camera, truth, calibration):
-    """Figures of one frame, in the order of HEADINGS; None where decoding is refused."""
+    """What was decoded of one frame (or of a list of them), and figures in the order of HEADINGS.
+
+    Raises:
+        DecodeError: decoding is refused.
+    """
     pattern = sequence.pattern
     begin = time.perf_counter()
     decoder = decoder_for(sequence, camera)
-    decoder.add(0, frame)
+    for position, each in enumerate(frame if isinstance(frame, list) else [frame]):
+        decoder.add(position, each)
     decoded = decoder.finish()
     spent = 1e3 * (time.perf_counter() - begin)
     flip = pattern.axis == "x"
