@@ -39,6 +39,10 @@ SPARSE_SHARE = 0.95
 """If this share of all points lies in fragments below the limit, the map is sparse by its method, and its points are no
 specks: the fragment filter then leaves it alone. A noisy background around one object stays well below it."""
 
+LINE_SHARE = 0.5
+"""If this share of all points has a neighbour along one axis of the image and none along the other, they lie on lines
+one pixel wide, sparse by the method as well (MCP's reference decoder: stripe peaks), however long the lines are."""
+
 BOX_KEYS = ("xmin:xmax", "ymin:ymax", "zmin:zmax")
 
 
@@ -233,9 +237,19 @@ def _in_fragment(there: Mask, min_pixels: int) -> Mask:
     _, labels, stats, _ = cv2.connectedComponentsWithStats(there.view(np.uint8), connectivity=4, ltype=cv2.CV_32S)
     small = stats[:, cv2.CC_STAT_AREA] < min_pixels
     small[0] = False
-    if stats[small, cv2.CC_STAT_AREA].sum() > SPARSE_SHARE * np.count_nonzero(there):
+    if stats[small, cv2.CC_STAT_AREA].sum() > SPARSE_SHARE * np.count_nonzero(there) or _on_lines(there):
         return np.zeros_like(there)
     return np.asarray(small[labels], dtype=np.bool_)
+
+
+def _on_lines(there: Mask) -> bool:
+    """Whether most points lie on lines one pixel wide."""
+    beside, above = np.zeros_like(there), np.zeros_like(there)
+    beside[:, 1:] = there[:, :-1]
+    beside[:, :-1] |= there[:, 1:]
+    above[1:] = there[:-1]
+    above[:-1] |= there[1:]
+    return bool(np.count_nonzero(there & (beside ^ above)) > LINE_SHARE * np.count_nonzero(there))
 
 
 @kernel

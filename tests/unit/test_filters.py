@@ -88,6 +88,21 @@ def test_specks_fall_and_large_islands_stay(ball):
     assert not falls[100:110, 60:70].any()
 
 
+def test_lines_one_pixel_wide_are_no_fragments_however_they_are_broken(ball):
+    depth = np.full(ball.lit.shape, np.nan)
+    depth[20:220:9] = 700  # whole stripes, above the limit
+    depth[24:220:9, np.arange(depth.shape[1]) % 17 < 12] = 700  # dotted ones, each dot below it
+    xyz = along_rays(ball, depth)
+    sigma = np.full(depth.shape, 0.1, np.float32)
+    for turned in (False, True):
+        points = np.ascontiguousarray(xyz.transpose(1, 0, 2)) if turned else xyz
+        falls, removed = apply_filters(
+            points, sigma.T if turned else sigma, np.ones(points.shape[:2]), FilterSettings()
+        )
+        assert removed["fragments"] == 0
+        assert not falls.any()
+
+
 def test_a_map_that_is_sparse_by_its_method_keeps_its_points(ball):
     depth = np.full(ball.lit.shape, np.nan)
     depth[::3, ::3] = 700
