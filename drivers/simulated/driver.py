@@ -10,11 +10,12 @@ from drivers.simulated.options import DEFAULT_SCENE, read_settings
 from drivers.simulated.projector import SimulatedProjector
 from drivers.simulated.rigs import rig, rig_names
 from drivers.simulated.scenes import scene_names
-from drivers.simulated.trigger_board import CAPABILITIES, SimulatedTriggerBoard
+from drivers.simulated.trigger_board import SimulatedTriggerBoard
 from drivers.simulated.world import enter_world
 from scanner.clock import Clock
 from scanner.devices import DeviceInfo
 from scanner.errors import ConfigError
+from scanner.trigger_protocol import CAPABILITIES
 
 DRIVER = "simulated"
 

@@ -16,24 +16,11 @@ from drivers.simulated.table_run import Step, TableRun
 from drivers.simulated.world import World
 from scanner.devices import Source, TableSlot, TriggerCapabilities, TriggerEvent, TriggerFault, TriggerSource
 from scanner.errors import DeviceBusy, DeviceError, DeviceLost
+from scanner.trigger_protocol import CAPABILITIES, VSYNC_TIMEOUT_MS
 from scanner.trigger_table import BoardTable, board_table
-
-CAPABILITIES = TriggerCapabilities(
-    sources=frozenset(TriggerSource),
-    max_steps=64,
-    max_repeats=65_535,
-    dark_min_us=50,
-    exposure_min_us=50,
-    time_max_us=10_000_000,
-    jitter_ns=1_000,
-)
-"""Those of the firmware in drivers/serial_trigger/firmware"""
 
 TICK_NS = 500
 """An edge is captured to a tick of the board's timer"""
-
-VSYNC_TIMEOUT_NS = 200_000_000
-"""No vertical blank for so long is a fault; an external trigger may take its time"""
 
 EMITS = 1
 
@@ -90,7 +77,7 @@ class SimulatedTriggerBoard:
             raise DeviceError("nothing is programmed", device=self._name, hint="load a table before arming")
         now = self._clock.now_ns()
         internal = self._source is TriggerSource.INTERNAL
-        timeout = VSYNC_TIMEOUT_NS if self._source is TriggerSource.VSYNC else 0
+        timeout = 1_000_000 * VSYNC_TIMEOUT_MS if self._source is TriggerSource.VSYNC else 0
         self._pulses_before += 0 if self._run is None else len(self._run.pulses)
         self._run = TableRun(self._steps(self._table), self._table.repeats, internal, now, timeout)
         self._runs += 1
