@@ -7,6 +7,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from msgspec import to_builtins
@@ -72,14 +73,14 @@ class Scan:
             self._opened.measure_latency(self._clock)
         rig = self._opened.rig
         exposure_ns = self._exposure_ns()
-        self._plan: Plan = rig.plan(self._sequence, repeat=self._repeat(), exposure_ns=exposure_ns)
+        self._plan: Plan = rig.plan(self._sequence, exposure_ns=exposure_ns, **self._plan_options())
         capabilities = rig.camera.capabilities
         self._format = CameraFormat(capabilities.width, capabilities.height, capabilities.bits, capabilities.mosaic)
         self._frame_bytes = self._format.width * self._format.height * self._format.dtype.itemsize
         self._say(self._need())
 
-    def _repeat(self) -> int:
-        return self._params.repeat
+    def _plan_options(self) -> dict[str, Any]:
+        return {"repeat": self._params.repeat}
 
     def _need(self) -> Need:
         frames = self._plan.frame_count

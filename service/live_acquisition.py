@@ -9,7 +9,7 @@ from typing import Any
 
 from scanner.capture import CaptureHeader, FrameRecord
 from scanner.clock import Clock
-from scanner.devices import Exposure
+from scanner.devices import Exposure, TriggerMode
 from scanner.errors import ConfigError, ScannerError
 from scanner.patterns import McpPattern
 from scanner.sequencer import EndlessFrame, endless
@@ -48,8 +48,17 @@ class LiveRun(Scan):
         frames = ring_slots(self._plan.camera_period_ns) if self._live.retain == "none" else 2 * SEGMENT
         return Need(self.job, 0, frames * self._frame_bytes, self._plan.as_dict())
 
-    def _repeat(self) -> int:
-        return SEGMENT
+    def _plan_options(self) -> dict[str, Any]:
+        """The rig file's trigger mode brings flips and frames together; nothing flips here, so the camera runs free."""
+        modes = self._opened.rig.camera.capabilities.trigger_modes
+        usable = (mode for mode in (TriggerMode.FREE, TriggerMode.SOFTWARE) if mode in modes)
+        if (mode := next(usable, None)) is None:
+            raise ConfigError(
+                "live needs a camera that runs free or takes software triggers",
+                device=self._opened.rig.camera.name,
+                hint="this one has a trigger line only: scan with it",
+            )
+        return {"repeat": SEGMENT, "trigger_mode": mode}
 
     def run(self, write_backs: WriteBacks) -> None:
         """Take frames, and say `taken` when the devices are free; `ended` follows when the recording is closed."""
