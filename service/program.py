@@ -17,7 +17,19 @@ from typing import Annotated, Any
 import typer
 
 from scanner.errors import ScannerError, StorageError
-from service.commands import audit, calibrate, check_config, daemon, decode, devices, live, patterns, scan, simulate
+from service.commands import (
+    audit,
+    calibrate,
+    check_config,
+    daemon,
+    decode,
+    devices,
+    doctor,
+    live,
+    patterns,
+    scan,
+    simulate,
+)
 from service.terminal import error_document, print_error, print_json
 
 FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
@@ -39,6 +51,7 @@ app.command()(audit.audit)
 app.command()(patterns.patterns)
 app.command()(devices.devices)
 app.add_typer(calibrate.group, name="calibrate")
+app.command()(doctor.doctor)
 app.command("check-config")(check_config.check_config)
 app.command()(daemon.daemon)
 app.command()(daemon.worker)

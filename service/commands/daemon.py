@@ -36,7 +36,7 @@ def daemon(
 
     rig = load_rig(config)
     start_logging("daemon")
-    run_daemon(rig, state_dir=state or _state_folder(), endpoint=connect or rig.daemon.endpoint, lifeline=False)
+    run_daemon(rig, state_dir=state or state_folder(), endpoint=connect or rig.daemon.endpoint, lifeline=False)
     return 0
 
 
@@ -94,7 +94,7 @@ def _flat(value: Any) -> str:
     return str(value)
 
 
-def _state_folder() -> Path:
+def state_folder() -> Path:
     """Where systemd says, or the system's place for root, or this user's."""
     if given := os.environ.get("STATE_DIRECTORY"):
         return Path(given.split(":")[0])

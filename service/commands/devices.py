@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 from service.commands.options import AsJson
 from service.terminal import print_json, print_table
 
+if TYPE_CHECKING:
+    from scanner.devices import DeviceInfo
+
 
 def devices(as_json: AsJson = False) -> int:
-    """List cameras, projectors and trigger boards, with the names that a rig file calls them by.
+    """List cameras, projectors and trigger boards, each with the piece of a rig file that names it.
 
     \b
     Examples:
@@ -24,4 +29,15 @@ def devices(as_json: AsJson = False) -> int:
         return 0
     rows = ((device.kind, device.driver, device.device, device.model) for device in found)
     print_table("devices", ("kind", "driver", "device", "model"), rows)
+    real = [device for device in found if device.driver != "simulated"]
+    for device in real:
+        print(f"\n# {device.model}\n{_piece(device)}")
+    if not real:
+        print("\nno device is plugged in that a driver can see (fringed doctor looks why); without one:")
+        print("fringed scan --rig simulated")
     return 0
+
+
+def _piece(device: DeviceInfo) -> str:
+    """A table of a rig file."""
+    return f"[{device.kind}]\ndriver = {json.dumps(device.driver)}\ndevice = {json.dumps(device.device)}"

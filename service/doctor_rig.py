@@ -1,0 +1,162 @@
+"""What a rig's own devices do: opened, timed, looked at and fired, as a scan would, and judged.
+
+The devices must be free: a daemon that drives them is asked to end first. Nothing is written; what was measured is
+told in the words of the rig file, to be put there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from itertools import pairwise
+from typing import Any
+
+from scanner.clock import Clock
+from scanner.devices import CameraSettings, ProjectorKind, TableSlot, TriggerSource
+from scanner.errors import ScannerError
+from scanner.sequencer import Rig, measure_latency
+from scanner.sequencer.light import Light, measure_light
+from service.config import RigConfig
+from service.doctor import Finding, Level
+from service.scan_setup import OpenRig, open_rig
+
+MOST_PULSING = 0.02
+"""Of a grey over phases of the refresh: below, a part of a refresh sees a grey to two hundredths, as noise does"""
+
+MOST_FLICKER = 0.005
+"""Of white from frame to frame: half a per cent moves a phase of three shifts by a 400th of a fringe"""
+
+LINEAR = 0.05
+"""Gammas nearer to 1 leave a second harmonic below 2 %, which four shifts or more cancel"""
+
+MOST_MISFIT = 0.02
+"""Rms that a pure exponent may leave: beyond, a table is wanted"""
+
+PULSES = 20
+
+Stage = Callable[[str], None]
+"""Told what is measured next."""
+
+
+def examine_rig(config: RigConfig, clock: Clock, stage: Stage) -> Iterator[Finding]:
+    """Open a rig's devices, measure, and give them back."""
+    stage("opening devices")
+    try:
+        opened = open_rig(config.model_dump(mode="json"), clock)
+    except ScannerError as error:
+        yield Finding("devices", Level.BAD, str(error), error.hint or "")
+        return
+    try:
+        yield Finding("devices", Level.OK, f"{opened.rig.camera.name}; {opened.rig.projector.name}")
+        for name, look in (("latency", latency), ("light", light), ("trigger line", pulses)):
+            stage(f"measuring {name}")
+            try:
+                yield from look(opened, clock)
+            except ScannerError as error:
+                yield Finding(name, Level.BAD, str(error), error.hint or "")
+    finally:
+        opened.close()
+
+
+def latency(opened: OpenRig, clock: Clock) -> Iterator[Finding]:
+    """From flip to light, against what rig file or driver say."""
+    rig, declared = opened.rig, opened.rig.projector.capabilities
+    if declared.kind is not ProjectorKind.FRAMEBUFFER:
+        yield Finding("latency", Level.OK, "the projector does not flip")
+        return
+    found, settle = measure_latency(
+        rig.projector, rig.camera, clock, settings=rig.settings, trigger_mode=rig.trigger_mode
+    )
+    words = (
+        f"latency_us = [{found.low_ns // 1000}, {-(-found.high_ns // 1000)}]\n"
+        f"settle_us = [{settle.low_ns // 1000}, {-(-settle.high_ns // 1000)}]"
+    )
+    said = f"{found.low_ns / 1e6:.2f} .. {found.high_ns / 1e6:.2f} ms, settled {settle.high_ns / 1e6:.2f} ms later"
+    known, source = rig.latency or declared.latency, "rig file" if rig.latency else "driver"
+    if known is None:
+        yield Finding("latency", Level.NOTE, f"{said}; the rig file has none", f"in [projector] write:\n{words}")
+    elif found.high_ns < known.low_ns or found.low_ns > known.high_ns:
+        wrong = f"{said}; the {source} says {known.low_ns / 1e6:.2f} .. {known.high_ns / 1e6:.2f} ms"
+        yield Finding("latency", Level.BAD, wrong, f"in [projector] write:\n{words}")
+    else:
+        yield Finding("latency", Level.OK, f"{said}, as the {source} says")
+
+
+def light(opened: OpenRig, clock: Clock) -> Iterator[Finding]:
+    """Contrast, pulses, flicker and gamma."""
+    rig = opened.rig
+    found = measure_light(
+        rig.projector,
+        rig.camera,
+        clock,
+        settings=CameraSettings(None, rig.settings.gain_db, rig.settings.pixel_format, rig.settings.region),
+        trigger_mode=rig.trigger_mode,
+    )
+    said = f"black {found.black:.1f}, white {found.white:.1f} at {found.exposure_ns / 1e6:.2f} ms"
+    yield Finding("light", Level.OK, f"{said}, on {found.lit_share:.0%} of the image")
+    yield _pulsing(found, rig)
+    yield _flicker(found)
+    if found.gamma is not None:
+        yield _gamma(found, opened)
+
+
+def pulses(opened: OpenRig, clock: Clock) -> Iterator[Finding]:
+    """Whether a trigger board hears the vertical blank and pulses at its period."""
+    board, refresh = opened.rig.trigger, opened.rig.projector.capabilities.refresh_ns
+    if board is None:
+        return
+    if TriggerSource.VSYNC not in board.capabilities.sources:
+        yield Finding("trigger line", Level.BAD, "the board has no vertical-sync input", "wire and flash one that has")
+        return
+    dark, pulse = board.capabilities.dark_min_us, max(board.capabilities.exposure_min_us, 100)
+    board.program([TableSlot(i, pulse, dark, wait_trigger=True) for i in range(PULSES)], TriggerSource.VSYNC)
+    board.arm()
+    clock.sleep_until(clock.now_ns() + (PULSES + 5) * refresh)
+    events, faults = board.events(), board.faults()
+    board.abort()
+    if faults or len(events) < PULSES:
+        said = faults[0].message if faults else f"{len(events)} of {PULSES} pulses were reported"
+        yield Finding("trigger line", Level.BAD, said, "check the wire from the display's vertical sync to the board")
+        return
+    gaps = [after.t_ns - before.t_ns for before, after in pairwise(events)]
+    period = (events[-1].t_ns - events[0].t_ns) / (PULSES - 1)
+    worst = max(abs(gap - period) for gap in gaps)
+    said = f"{1e9 / period:.3f} Hz, the display says {1e9 / refresh:.3f} Hz; spacing within {worst / 1e3:.0f} us"
+    level = Level.OK if abs(period - refresh) < 0.01 * refresh else Level.BAD
+    mend = "" if level is Level.OK else "is it this display's vertical sync? Set its mode in the rig file"
+    yield Finding("trigger line", level, said, mend)
+
+
+def _pulsing(found: Light, rig: Rig) -> Finding:
+    period = rig.projector.capabilities.modulation_period_ns
+    if found.pulsing < MOST_PULSING:
+        return Finding("grey", Level.OK, f"constant over the refresh ({found.pulsing:.1%})")
+    said = f"built of pulses over the refresh (a short exposure sees {found.pulsing:.0%} more or less)"
+    if period is not None:
+        return Finding("grey", Level.OK, f"{said}; exposures are whole periods of {period / 1e6:.2f} ms")
+    mend = "expose for whole refreshes: leave exposure_us out, or set it to a multiple of the refresh"
+    return Finding("grey", Level.BAD, f"{said}, and the driver says it is constant", mend)
+
+
+def _flicker(found: Light) -> Finding:
+    said = f"white differs by {found.flicker:.2%} from frame to frame"
+    if found.flicker < MOST_FLICKER:
+        return Finding("flicker", Level.OK, said)
+    mend = "shield the room's light, switch the projector's eco and dynamic modes off, or expose for more refreshes"
+    return Finding("flicker", Level.BAD, said, mend)
+
+
+def _gamma(found: Light, opened: OpenRig) -> Finding:
+    content = {} if opened.calibration is None else opened.calibration.extra.get("response") or {}
+    known: Mapping[str, Any] = content.get("projector") or {}
+    said = f"greys follow an exponent of {found.gamma:.2f}"
+    if "table" in known:
+        return Finding("gamma", Level.OK, f"{said}; the calibration has a table that undoes it")
+    if found.gamma_misfit > MOST_MISFIT:
+        mend = "switch picture modes, keystone and dynamic contrast off; fringed calibrate response measures a table"
+        return Finding("gamma", Level.BAD, f"{said} badly ({found.gamma_misfit:.1%} rms left)", mend)
+    undone = float(known.get("gamma", 1.0))
+    if found.gamma is None or abs(found.gamma - undone) < LINEAR * undone:
+        return Finding("gamma", Level.OK, said if undone == 1 else f"{said}, which the calibration undoes")
+    other = f"the calibration undoes {undone:.2f}" if "gamma" in known else "nothing undoes it"
+    mend = f'put "response": {{"projector": {{"gamma": {found.gamma:.2f}}}}} into the calibration file'
+    return Finding("gamma", Level.NOTE, f"{said}; {other}", mend)
