@@ -186,7 +186,7 @@ class CameraSettingsConfig(_Table):
     )
     trigger_mode: Literal["software", "free", "hardware"] | None = Field(
         default=None,
-        description='"hardware" (trigger line), "software" or "free" (free run); leave it out to let the planner choose',
+        description='"hardware" (trigger line), "software" or "free" (free run); without it the planner chooses',
     )
 
 
