@@ -217,32 +217,35 @@ def _decide(found: Found, model: PatternModel, clock: Stages) -> _Decision:
         scale_field = magnification.fit_field(signals.light, peaks, chains, model, search, size, shape)
     with clock.stage("emissions"):
         seen = emissions.measure(signals.light, chains, scale_field, model, search.scale, size)
-    modulation = emissions.first_modulation(seen, model)
+    sites = linking.sites_of(peaks, chains)
+    here = seen.at(sites.index)
+    modulation = emissions.first_modulation(here, model)
     floor = np.full(model.channels, 0.03, np.float32)
     tables = hmm.transitions(model.stripes)
-    gap = hmm.gaps(peaks.start, peaks.y, peaks.height, found.pitch, model.weakest)
-    votes = np.zeros((len(peaks), model.stripes), np.float32)
+    gap = hmm.gaps(sites.start, peaks.y[sites.index], peaks.height[sites.index], found.pitch, model.weakest)
+    votes = np.zeros((len(gap), model.stripes), np.float32)
     posterior = votes
     for _ in range(ROUNDS):
         with clock.stage("emissions"):
-            evidence, stray_log = emissions.log_likelihood(seen, model, modulation, floor)
+            evidence, stray_log = emissions.log_likelihood(here, model, modulation, floor)
         with clock.stage("columns' model"):
-            posterior, _stray = hmm.smooth_columns(evidence + votes, peaks.start, gap, tables, stray_log)
+            posterior, _stray = hmm.smooth_columns(evidence + votes, sites.start, gap, tables, stray_log)
         with clock.stage("votes"):
             logs = linking.floored_log(posterior, POSTERIOR_FLOOR)
-            votes = linking.votes_along(logs, chains, size / (2 * stripes.STEP), VOTE_GAIN)
-            modulation, floor = emissions.refined_modulation(seen, model, posterior, modulation)
+            votes = linking.votes_along(logs, sites.chains, size / (4 * stripes.STEP), VOTE_GAIN)
+            modulation, floor = emissions.refined_modulation(here, model, posterior, modulation)
     with clock.stage("columns' model"):
-        path = hmm.best_paths(evidence + votes, peaks.start, gap, tables, stray_log)
+        path = hmm.best_paths(evidence + votes, sites.start, gap, tables, stray_log)
     with clock.stage("votes"):
-        along = linking.path_along(logs, chains, SWITCH_COST)
-    confidence = np.where(path >= 0, posterior[np.arange(len(path)), np.maximum(path, 0)], 0).astype(np.float32)
-    long_enough = np.repeat(chains.lengths * stripes.STEP >= MIN_CHAIN_PX, chains.lengths)
-    in_long = np.zeros(len(peaks), bool)
-    in_long[chains.order] = long_enough
-    beyond = linking.silhouettes(found.reduced, peaks, chains)
-    label = np.where((path == along) & (confidence >= DECIDED) & in_long & ~beyond, path, -1).astype(np.int32)
-    agrees = emissions.agreement(seen, evidence, model, modulation, path, (peaks.start, gap))
+        along = linking.path_along(logs, sites.chains, SWITCH_COST)
+        sure = np.where(path >= 0, posterior[np.arange(len(path)), np.maximum(path, 0)], 0).astype(np.float32)
+        decided = np.where((path == along) & (sure >= DECIDED), path, -1).astype(np.int32)
+        label, confidence = linking.between_sites(decided, sure, sites, chains)
+        long_enough = np.repeat(chains.lengths * stripes.STEP >= MIN_CHAIN_PX, chains.lengths)
+        label[chains.order[~long_enough]] = -1
+        label[linking.silhouettes(found.reduced, peaks, chains)] = -1
+    with clock.stage("agreement"):
+        agrees = emissions.agreement(here, evidence, model, modulation, path, (sites.start, gap))
     with clock.stage("sub-pixel"):
         fine = subpixel.refine(found.reduced, peaks, chains, label, found.pitch)
     figures = {

@@ -56,6 +56,10 @@ class Amplitudes:
     sigma: Array
     light: Array
 
+    def at(self, index: Ints) -> Amplitudes:
+        """Those of some peaks."""
+        return Amplitudes(self.ratio[index], self.sigma[index], self.light[index])
+
 
 def measure(light: Array, chains: Chains, field: Array, model: PatternModel, scale: float, size: int) -> Amplitudes:
     """Carrier amplitudes at every peak.

@@ -109,6 +109,63 @@ def _link(start: Ints, y: Array, height: Array, reach: np.float32, bend: np.floa
     return order, chains[: c + 1].copy()
 
 
+@dataclass(frozen=True, eq=False)
+class Sites:
+    """Peaks of every second column, where stripes are told apart: windows along a stripe are eight columns and more,
+    so that its neighbours say the same.
+
+    index: (M,) int32, which peaks. start: (C + 1,) int32, where columns begin. chains: of the sites among themselves.
+    """
+
+    index: Ints
+    start: Ints
+    chains: Chains
+
+
+def sites_of(peaks: Peaks, chains: Chains) -> Sites:
+    """The sites among `peaks`, with what is left of the chains; a chain without a site is empty."""
+    chosen = chains.column % 2 == 0
+    number = np.cumsum(chosen, dtype=np.int32) - np.int32(1)
+    in_order = chosen[chains.order]
+    counts = np.diff(peaks.start)[::2]
+    before = np.concatenate(([0], np.cumsum(in_order)))[chains.start]
+    index = np.flatnonzero(chosen).astype(np.int32)
+    left = Chains(number[chains.order[in_order]], before.astype(np.int32), chains.column[index] // 2)
+    return Sites(index, np.concatenate(([0], np.cumsum(counts))).astype(np.int32), left)
+
+
+def between_sites(label: Ints, confidence: Array, sites: Sites, chains: Chains) -> tuple[Ints, Array]:
+    """What the sites were decoded as, for all peaks: a peak between two sites of its chain needs both to agree.
+
+    Args:
+        label: (M,) int32, -1 undecided.
+        confidence: (M,) float32.
+        sites: the sites.
+        chains: of all P peaks.
+
+    Returns:
+        label (P,) int32 and confidence (P,) float32.
+    """
+    every, sure = np.full(len(chains.order), -1, np.int32), np.zeros(len(chains.order), np.float32)
+    every[sites.index], sure[sites.index] = label, confidence
+    _between_sites(chains.order, chains.start, chains.column, every, sure)
+    return every, sure
+
+
+@kernel
+def _between_sites(order: Ints, start: Ints, column: Ints, label: Ints, confidence: Array) -> None:
+    for c in range(len(start) - 1):
+        for p in range(start[c], start[c + 1]):
+            k = order[p]
+            if column[k] % 2 == 0:
+                continue
+            a = order[p - 1] if p > start[c] else order[min(p + 1, start[c + 1] - 1)]
+            b = order[p + 1] if p + 1 < start[c + 1] else a
+            if a != k and label[a] == label[b]:
+                label[k] = label[a]
+                confidence[k] = min(confidence[a], confidence[b])
+
+
 def silhouettes(reduced: Array, peaks: Peaks, chains: Chains) -> NDArray[np.bool_]:
     """Peaks at a chain's end that lie beyond the object's edge: (P,) bool.
 

@@ -118,10 +118,11 @@ def name_2x_4x(calm: Array, stripe: Labels, sure: Array, peaks: Peaks) -> Marks:
     """Peaks with their minima (2x) and mid-levels (4x) between consecutive stripes (sec. 2.1, fig. 5.14).
 
     Between stripes of unequal light blur moves the minimum towards the dim one, by one to two pixels where the dim one
-    is a fifth as bright; mid-levels move less. The published pattern has such stripes throughout.
+    is a fifth as bright; mid-levels move less. The published pattern has such stripes throughout, and what was
+    published of depth agrees with them (tables 5.4, 5.7): they are left as they are.
 
     Args:
-        calm: (H, W), the image but for noise.
+        calm: (H, W), the image but for noise, rows not averaged.
         stripe: (P,) stripe index, both kinds, -1 none. Consecutive: one apart.
         sure: (P,) confidence. Minima and mid-levels take the lesser neighbour's.
         peaks: where they are.

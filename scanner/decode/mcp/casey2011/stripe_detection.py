@@ -89,9 +89,12 @@ def detect(image: NDArray[np.uint8] | NDArray[np.uint16], stripes: int, weakest:
     return Stripes(calm, enhanced, region, peaks, wavelength, dark, threshold)
 
 
-def calmed(grey: Array, wavelength: float) -> Array:
-    """The image in which peaks and minima are sought: a short moving average, (H, W) float32."""
-    return np.asarray(cv2.blur(grey, (2 * round(ALONG * wavelength / 2) + 1, ACROSS)), np.float32)
+def calmed(grey: Array, wavelength: float, across: int = ACROSS) -> Array:
+    """The image in which peaks are sought: a short moving average, (H, W) float32.
+
+    Minima and mid-levels are sought with `across` 1: rows on either side of a minimum between unequal stripes differ.
+    """
+    return np.asarray(cv2.blur(grey, (2 * round(ALONG * wavelength / 2) + 1, across)), np.float32)
 
 
 def enhance(grey: Array, wavelength: float) -> Array:
