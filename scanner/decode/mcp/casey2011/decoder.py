@@ -41,8 +41,8 @@ reference scenes lie above 15."""
 
 AGREEMENT = 0.55
 """Least share of the filtered code words on the peaks that the model's path keeps. The reference scenes keep .66 and
-more, be they dark, ambient, blurred or clipped; wrong orders of codes keep up to .35 where the whole pattern is seen, and .53 where a small object shows five
-code words only."""
+more, be they dark, ambient, blurred or clipped; wrong orders of codes keep up to .35 where the whole pattern is seen,
+and .53 where a small object shows five code words only."""
 
 
 class CaseyDecoder(McpDecoder):
