@@ -19,6 +19,7 @@ scan: setup ## scan the simulated rig; ARGS="--method mcp" and the like are pass
 	@setup/scan.sh $(ARGS)
 
 test: setup ## all tests; ARGS="-k config" and the like are passed on
+	@setup/firmware-tools.sh
 	@$(bin)/python -m pytest -q $(ARGS)
 
 rig: setup ## the drivers against the kernel's virtual devices, in a guest under QEMU

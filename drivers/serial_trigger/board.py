@@ -322,8 +322,6 @@ class SerialTriggerBoard:
             self._run.faults.append(
                 TriggerFault("reset", "the board began anew: its supply or its reset line was disturbed")
             )
-        # Its sums are off again; requests carry them all the same, and answers without count as noise until then.
-        self._link.relax_sums()
         self._link.ask("*CRC 1")
         self._link.require_sums()
         self._read_clock()

@@ -11,26 +11,29 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.serial_trigger.protocol import Answer, Damaged, LineReader, Message, Ok, Refusal
+from drivers.serial_trigger.protocol import Answer, Damaged, LineReader, Message, Ok, Ready, Refusal
 from drivers.serial_trigger.transport import Transport
 from scanner.clock import Clock
 from scanner.errors import DeviceError, DeviceLost
 from scanner.trigger_protocol import ABORT_BYTE, framed
 
-ANSWER_S = 0.2
+ANSWER_S = 0.15
 """An answer comes within 50 ms of its request; USB and a busy host may add to that"""
 
-TRIES = 4
-"""Of a request that noise destroys. Silence takes two of them at most: see `ask`"""
+TRIES = 6
+"""Of a request that noise destroys"""
 
-SILENCES = 2
-"""Answers that may stay out before the board counts as lost: 0.4 s, well within the second that is promised"""
+SILENCES = 3
+"""Answers that may stay out before the board counts as lost: 0.45 s, within the second that is promised"""
 
 QUIET_S = 0.03
 """After a damaged line, nothing may come for so long before the next request: what noise made of one line can be two"""
 
 _NOISE = {1, 6}
 """Refusals that say the request did not arrive whole: crc, line"""
+
+_NOISE_WITHOUT_SUMS = _NOISE | {2, 7}
+"""As long as the board does not insist on check sums, one that was hit itself makes the line another one"""
 
 
 @dataclass(frozen=True)
@@ -76,10 +79,6 @@ class Link:
         """From now on a line without a check sum is noise."""
         self._reader.need_sum = True
 
-    def relax_sums(self) -> None:
-        """Lines may come without a check sum: the board has begun anew."""
-        self._reader.need_sum = False
-
     def ask(self, command: str, *, repeat: bool = True, tries: int = TRIES) -> str:
         """The value that the board answers to `command`.
 
@@ -107,8 +106,10 @@ class Link:
             if heard is None:
                 silences += 1
             elif isinstance(heard[1], Ok):
+                if silences:
+                    self._wait_for_quiet()  # the answer that stayed out may only have been late
                 return Timed(heard[1].value, sent, heard[0], len(request), len(framed(_said(heard[1]))))
-            elif isinstance(heard[1], Refusal) and heard[1].code not in _NOISE:
+            elif isinstance(heard[1], Refusal) and not self._is_noise(heard[1]):
                 raise DeviceError(
                     f"the board refuses {command}: {heard[1].text} ({heard[1].code})",
                     device=self.name,
@@ -154,6 +155,8 @@ class Link:
                     self._answers.put((now, message))
                     continue
                 self.heard_ns = now
+                if isinstance(message, Ready):
+                    self._reader.need_sum = False  # it has begun anew, and gives none until it is told to
                 if isinstance(message, Ok | Refusal):
                     self._answers.put((now, message))
                 else:
@@ -164,6 +167,9 @@ class Link:
         self._answers.put((self._clock.now_ns(), lost))
 
     # --- the asking thread ---------------------------------------------------------------------------------------
+
+    def _is_noise(self, refusal: Refusal) -> bool:
+        return refusal.code in (_NOISE if self._reader.need_sum else _NOISE_WITHOUT_SUMS)
 
     def _write(self, data: bytes) -> None:
         if self.lost is not None:

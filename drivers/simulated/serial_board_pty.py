@@ -52,8 +52,9 @@ class PtyBoard:
         self._slave = slave
         self._rate = 1 + 1e-6 * clock_ppm
         self._vsync_ns = None if vsync_us is None else round(1e3 * vsync_us)
-        self._faults = faults or LineFaults()
-        self._random = np.random.default_rng(self._faults.seed)
+        self.faults = faults or LineFaults()
+        """may be changed at any time"""
+        self._random = np.random.default_rng(self.faults.seed)
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._hung = threading.Event()
@@ -161,7 +162,7 @@ class PtyBoard:
                 self._send(output)
 
     def _send(self, said: Said) -> None:
-        faults = self._faults
+        faults = self.faults
         data = self._flipped(said.data)
         if self._random.random() < faults.garbage:
             data = bytes(self._random.integers(0, 256, 6, dtype=np.uint8)) + b"\n" + data
@@ -172,7 +173,7 @@ class PtyBoard:
 
     def _flipped(self, data: bytes) -> bytes:
         """With one bit flipped, as often as that happens."""
-        if self._random.random() >= self._faults.flip:
+        if self._random.random() >= self.faults.flip:
             return data
         place, bit = int(self._random.integers(len(data))), int(self._random.integers(8))
         return data[:place] + bytes([data[place] ^ 1 << bit]) + data[place + 1 :]

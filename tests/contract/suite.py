@@ -432,10 +432,10 @@ class TriggerContract:
 
     def test_a_table_longer_than_its_memory_runs_if_it_repeats(self, bench: TriggerBench) -> None:
         count = 2 * bench.board.capabilities.max_steps + 2
-        slots = self._slots(count, wait_trigger=False, dark_us=3_000, exposure_us=2_000)
+        slots = self._slots(count, wait_trigger=False, dark_us=1_500, exposure_us=1_000)
         events = bench.run(slots, TriggerSource.INTERNAL, count)
         assert [event.step for event in events] == list(range(count))
-        self._spaced(bench, events, [5_000_000] * (count - 1))
+        self._spaced(bench, events, [2_500_000] * (count - 1))
 
     def test_event_times_are_known_with_a_bound(self, bench: TriggerBench) -> None:
         for event in bench.run(self._slots(3), TriggerSource.VSYNC, 3):

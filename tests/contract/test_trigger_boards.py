@@ -16,7 +16,7 @@ from scanner.clock import MonotonicClock, VirtualClock
 from tests.contract.suite import TriggerBench, TriggerContract
 from tests.firmware.simavr import Simavr, build, on_pty
 
-REFRESH_US = 16_667
+REFRESH_US = 8_333
 
 
 @pytest.fixture(scope="module")
