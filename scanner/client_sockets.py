@@ -58,8 +58,7 @@ def conflated(opened: _Socket, endpoint: str) -> _Socket:
     opened.setsockopt(zmq.LINGER, 0)
     opened.setsockopt(zmq.CONFLATE, 1)
     opened.setsockopt(zmq.MAXMSGSIZE, MAX_LIVE_BYTES)
-    opened.setsockopt(zmq.RECONNECT_IVL, 50)
-    opened.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
+    opened.setsockopt(zmq.RECONNECT_IVL, 50)  # and no longer with each attempt: a worker may take a second to be there
     opened.setsockopt(zmq.SUBSCRIBE, b"")
     opened.connect(endpoint)
     return opened

@@ -18,7 +18,7 @@ from typing import Any
 
 import msgspec
 
-from scanner.errors import DecodeError, DeviceBusy, ScannerError, StorageError
+from scanner.errors import DeviceBusy, ScannerError, StorageError
 from scanner.wire import LiveStart, Refused
 from service.devices_link import DevicesLink
 from service.jobs import Job, JobState
@@ -66,10 +66,12 @@ class Live:
             StorageError: its record cannot be written.
         """
         store = self._pipeline.store
+        if store.find(params, client) is None:
+            await self._until_let_go()
+        # Looked up again: the same call may have come twice meanwhile. From here to the run nothing is waited for.
         job = store.find(params, client)
         if job is not None:
             return job
-        await self._until_let_go()
         if self._run is not None and self.running:
             raise DeviceBusy(f"live run {self._run.job.id} is under way", hint="live.stop ends it")
         if (scan := self._pipeline.busy_with) is not None:
@@ -134,6 +136,7 @@ class Live:
         job.files = tuple(files)
         job.reason = "daemon_restarted"
         if not files:
+            await asyncio.to_thread(shutil.rmtree, folder.parent, ignore_errors=True)
             error = ScannerError("the daemon was restarted during this live run", hint="start another one")
             await self._pipeline.end(job, JobState.FAILED, reason="daemon_restarted", error=error)
             return
@@ -175,7 +178,7 @@ class LiveRun:
         self._began: float | None = None
         self._ended: float | None = None
         self._past: deque[tuple[float, int, int]] = deque()
-        self._failure: ScannerError | None = None
+        self._failure: tuple[ScannerError, str] | None = None
 
     @property
     def holds_devices(self) -> bool:
@@ -260,11 +263,17 @@ class LiveRun:
         _log.info("live run %s: delivery %d", self.job.id, number)
 
     def _decoding_ended(self, outcome: asyncio.Future[Any]) -> None:
-        """Without decoding a run goes on only to record."""
-        if outcome.cancelled() or outcome.exception() is None:
-            return
-        problem = outcome.exception()
-        self._failure = problem.error if isinstance(problem, WorkerLost) else problem  # type: ignore[assignment]
+        """A run that no worker can decode is over."""
+        problem = None if outcome.cancelled() else outcome.exception()
+        if isinstance(problem, WorkerLost):
+            self._fail(problem.error, "worker_lost")
+        elif isinstance(problem, ScannerError):
+            self._fail(problem, reason_to_fail(problem))
+
+    def _fail(self, error: ScannerError, reason: str) -> None:
+        """End soon, as failed."""
+        if self._failure is None:
+            self._failure = (error, reason)
         self.stop()
 
     async def _reserve(self) -> None:
@@ -274,8 +283,7 @@ class LiveRun:
         try:
             await self._pipeline.on_disk(reserve, self._pipeline.spool, self._kept, list(self._pipeline.store))
         except StorageError as error:
-            self._failure = error
-            self.stop()
+            self._fail(error, "disk_full")
 
     # --- the end -----------------------------------------------------------------------------------------------
 
@@ -286,9 +294,10 @@ class LiveRun:
         if ended.reason == "cancelled":  # before the first frame
             await pipeline.end(job, JobState.CANCELLED, reason="cancelled")
             return
-        error = self._failure
-        if error is None and ended.reason != "completed":
+        failure = self._failure
+        if failure is None and ended.reason != "completed":
             error = error_of(ended)
+            failure = (error, ended.reason or reason_to_fail(error))
         if self._params.retain == "none":
             await asyncio.to_thread(shutil.rmtree, folder.parent, ignore_errors=True)
         elif folder.exists():
@@ -299,11 +308,10 @@ class LiveRun:
         if job.state is JobState.ACQUIRED:
             await pipeline.save(job)
             pipeline.tell(job, "acquired", {"reason": ended.reason, **job.report})
-        if error is None:
+        if failure is None:
             await pipeline.end(job, JobState.DONE, reason="completed")
-            return
-        reason = ended.reason if ended.reason not in (None, "completed") else _reason(error)
-        await pipeline.end(job, JobState.FAILED, reason=reason or reason_to_fail(error), error=error)
+        else:
+            await pipeline.end(job, JobState.FAILED, reason=failure[1], error=failure[0])
 
     async def _end_decoding(self) -> None:
         series = self._series
@@ -372,10 +380,3 @@ class LiveRun:
                     "live.counts",
                     {key: value for key, value in figures.items() if key not in ("header", "calibration")},
                 )
-
-
-def _reason(error: ScannerError) -> str | None:
-    """Why a run ended that the daemon ended."""
-    if isinstance(error, StorageError):
-        return "disk_full"
-    return "worker_lost" if isinstance(error, DecodeError) else None

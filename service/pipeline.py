@@ -78,8 +78,9 @@ class Pipeline:
 
     @property
     def busy_with(self) -> Job | None:
-        """A job that has the devices, or waits for them."""
-        waiting = (job for job in self._queue if job.state is JobState.QUEUED)
+        """A scan that has the devices, or waits for them."""
+        # Those of the store: one whose record is being written is not in the queue yet.
+        waiting = (job for job in self.store if job.state is JobState.QUEUED and job.kind == "scan")
         return self._acquiring or next(waiting, None)
 
     async def submit(self, params: ScanStart, client: str) -> Job:

@@ -136,6 +136,7 @@ def _live(
             with suppress(KeyboardInterrupt), _line() as line:  # Ctrl-C is how a run is ended
                 watching.all(client.live_frames(job_id), line)
         finally:
+            begun()
             stop(client, job_id)
             if record is not None:
                 _fetch(client, job_id, record)
@@ -189,7 +190,7 @@ def figures(live: Mapping[str, Any]) -> str:
         f"{live['lost']:,} lost" if live["lost"] else "",
         f"latency {_ms(latency['p50'])}, p99 {_ms(latency['p99'])}",
         f"{live['points']:,} points",
-        f"{live['recorded']['frames']:,} recorded" if live["retain"] != "none" else "",
+        "recording" if live["retain"] != "none" else "",
         f"({live['problem']})" if live["problem"] else "",
     ]
     return "  ".join(part for part in parts if part)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
+import signal
+import threading
 import time
 import uuid
 from collections.abc import Iterator
@@ -14,12 +18,14 @@ import zmq
 
 from scanner.capture import Capture
 from scanner.client import AsyncClient, Client
-from scanner.errors import ConfigError, DeviceBusy, ScannerError
+from scanner.errors import ConfigError, DecodeError, DeviceBusy, ScannerError
 from scanner.geometry import calibration_from_dict, load_calibration
 from scanner.reconstruct import DecodeOptions
 from scanner.reconstruct_live import LiveReconstruction
+from scanner.scan import load_scan
 from scanner.series import read_series
 from scanner.wire import Refused
+from service.cli import main
 from service.config import load_rig
 from service.private import private_daemon
 
@@ -124,6 +130,7 @@ def test_one_at_a_time_and_no_scan_meanwhile(client: Client) -> None:
         ({"pattern": {"carriers": [1, 2]}}, ConfigError, "carriers"),
         ({"exposure": 1e9}, ConfigError, "exposure"),
         ({"filters": {"depth": [9.0, 1.0]}}, ConfigError, "depth"),
+        ({"decoder": "none such"}, DecodeError, "none such"),
         ({"stride": 0}, Refused, "stride"),
         ({"retain": "some"}, Refused, "retain"),
         ({"method": "pmp"}, Refused, "method"),
@@ -204,3 +211,60 @@ async def test_async_clients_read_too(client: Client, endpoint: str) -> None:
         run = await one.live_status()
         assert run is not None
         assert run["state"] in ("acquired", "done")
+
+
+# --- fringed live, fringed decode ---------------------------------------------------------------------------------
+
+
+def test_the_command_records_draws_and_says_how_it_went(
+    endpoint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    take, picture = tmp_path / "take", tmp_path / "now.png"
+    words = ["live", "--connect", endpoint, "--exposure", "15000", "--seconds", "0.4", "--record", str(take)]
+    assert main([*words, "--picture", str(picture), "--json"]) == 0
+    said = capsys.readouterr()
+    report = json.loads(said.out)
+    assert report["state"] == "done"
+    assert report["recorded"]["frames"] == report["captured"] > 15
+    assert sum(count for _, count in report["latency_ms"]["bins"]) == report["latency_ms"]["count"]
+    assert "frames/s in" in said.err
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert {path.name for path in take.iterdir()} == {"000000", "series.json"}
+    assert main(words) == 1  # the folder is not empty
+    assert main(["decode", str(take), "--frames", "3:4", "--json"]) == 0
+    decoded = json.loads(capsys.readouterr().out)
+    assert [frame["number"] for frame in decoded["frames"]] == [3, 4]
+    scan = load_scan(take / "scan" / "000003")
+    assert scan.report["live"]["number"] == 3
+    assert scan.report["points"] == decoded["frames"][0]["points"] > 50_000
+
+
+def test_ctrl_c_ends_the_command_well(endpoint: str, client: Client, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupt() -> None:
+        while (run := client.live_status()) is None or run["state"] != "acquiring" or not run["live"]["decoded"]:
+            time.sleep(0.02)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    client.live_start(seconds=0.05, **SHORT)  # so that the run before is over, and known to be
+    waiting = threading.Thread(target=interrupt)
+    wait_until_over(client)
+    waiting.start()
+    assert main(["live", "--connect", endpoint, "--exposure", "15000"]) == 0
+    waiting.join()
+    assert "latency" in capsys.readouterr().out
+    run = client.live_status()
+    assert run is not None
+    assert run["state"] == "done"
+
+
+def wait_until_over(client: Client) -> None:
+    while (run := client.live_status()) is not None and run["state"] != "done":
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    "words", [["--last", "3"], ["--stride", "2"], ["--picture", "now.gif"], ["--rig", "simulated", "--connect", "x"]]
+)
+def test_wrong_usage_is_told_before_anything_moves(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["live", *words]) == 2
+    assert words[0] in capsys.readouterr().err
