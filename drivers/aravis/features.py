@@ -56,6 +56,10 @@ class Features:
         self._device = device
         self._name = name
 
+    def forget(self) -> None:
+        """Let go of the device: an error's traceback may keep this object for a while."""
+        self._device = None
+
     def has(self, feature: str) -> bool:
         """Whether the camera has it, and it can be used now."""
         return bool(self._call("looking for", feature, lambda: self._device.is_feature_available(feature)))
@@ -150,6 +154,11 @@ class Features:
             return False
         self.set(feature, value)
         return True
+
+    def set_at_most(self, feature: str, most: int) -> None:
+        """Lower an integer that is larger than this, where the camera has it."""
+        if self.writable(feature) and self.get(feature, int) > most:
+            self.set(feature, most)
 
     def execute(self, command: str) -> None:
         """Run a command."""

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import ipaddress
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
 from drivers.aravis.library import USB_HINT, aravis, is_library_error, translated
+from drivers.aravis.watch import GvcpProbe, Restarted
 from scanner.errors import ConfigError, DeviceBusy, DeviceNotFound
+
+LOOKS, LOOK_S = 3, 0.2
+"""How often, and for how long each time, a camera is asked for a sign of life before it is opened"""
 
 NONE_FOUND = (
     "is it powered, and on this network? A GigE camera is found on networks this machine has an address in; "
@@ -71,6 +76,7 @@ def open_camera(device: str) -> Any:
     name = device if is_address(device) else _identity(device)
     try:
         if is_address(device):
+            _look_for(device)
             # Straight to the network: a look at every USB device first would take time and leave a monitor running.
             opened = library.GvInterface.get_instance().open_device(device)
             camera = library.Camera.new_with_device(opened)
@@ -83,6 +89,17 @@ def open_camera(device: str) -> Any:
     if camera.is_gv_device() and not camera.get_device().is_controller():
         raise DeviceBusy("another program controls the camera", device=device or name, hint="close that program")
     return camera
+
+
+def _look_for(address: str) -> None:
+    """Ask for a sign of life: the library takes seconds to see that there is none."""
+    with closing(GvcpProbe(address)) as probe:
+        try:
+            if any(probe.alive(LOOK_S) for _ in range(LOOKS)):
+                return
+        except Restarted:  # nobody controls it: that is what we hope for
+            return
+    raise DeviceNotFound(f"no camera answers at {address}", device="aravis", hint=NONE_FOUND)
 
 
 def is_address(device: str) -> bool:

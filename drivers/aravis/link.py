@@ -17,6 +17,7 @@ from drivers.aravis.features import Features
 from drivers.aravis.find import open_camera
 from drivers.aravis.library import is_library_error, translated
 from drivers.aravis.options import Options
+from drivers.aravis.sockets import ControlSocket, udp_inodes
 from drivers.aravis.stream import Received, Stream
 from drivers.aravis.watch import CallProbe, GvcpProbe, Watch
 from drivers.aravis.worker import Worker
@@ -30,7 +31,13 @@ LATCH, LATCHED_HIGH, LATCHED_LOW = 0x0944, 0x0948, 0x094C
 LATCHES = 8
 """Readings of the clock at once: the one with the shortest way is kept"""
 
+HEARTBEAT_MS = 3000
+"""A camera that lost us is free for the next one after this; some wait for a minute by default"""
+
 CLOSE_S = 6.0
+
+_opening = threading.Lock()
+"""One camera is opened at a time: its socket is the one that was not there before"""
 
 
 class Link:
@@ -53,6 +60,7 @@ class Link:
         self._worker = Worker(name)
         self._camera: Any = None
         self._tick_hz = 0
+        self._control: ControlSocket | None = None
         self.clock = ClockFit(latched=True)
         try:
             self._worker.call(lambda: self._open(device))
@@ -124,13 +132,19 @@ class Link:
         if self.stream is not None:
             self.stream.end()
         self._worker.post(self._let_go)
-        self._worker.end(0.0 if self.lost.is_set() else CLOSE_S)
+        self._worker.end(CLOSE_S)
 
     # --- on the link's thread --------------------------------------------------------------------------------------
 
     def _open(self, device: str) -> None:
-        camera = self._camera = open_camera(device)
+        with _opening:
+            before = udp_inodes()
+            camera = open_camera(device)
+            if camera.is_gv_device():
+                interface = camera.get_device().get_interface_address().get_address().to_string()
+                self._control = ControlSocket(before, interface)
         self.features = Features(camera.get_device(), self.name)
+        self._camera = camera
         self.is_gige = bool(camera.is_gv_device())
         self.address = ""
         if self.is_gige:
@@ -139,6 +153,7 @@ class Link:
         self.switched_off = self.features.switch_off_automatics()
         if self.is_gige:
             self._set_packets()
+            self.features.set_at_most("GevHeartbeatTimeout", HEARTBEAT_MS)
         self._choose_clock()
 
     def _set_packets(self) -> None:
@@ -195,10 +210,15 @@ class Link:
         if stream is not None:
             stream.close()
         del stream
-        if self._camera is not None and not self.lost.is_set():
-            self.features.execute_if_there("AcquisitionStop")
-        self.features = Features(None, self.name)
+        if self._camera is not None:
+            try:
+                if not self.lost.is_set():
+                    self.features.execute_if_there("AcquisitionStop")
+            finally:
+                self.features.forget()
         self._camera = None
+        if self._control is not None:
+            self._control.close()
 
     def _probe(self) -> GvcpProbe | CallProbe:
         if self.is_gige:
@@ -213,6 +233,8 @@ class Link:
             return
         self.reason = reason
         self.lost.set()
+        if self._control is not None:
+            self._control.cut(self.address)
         stream = self.stream
         if stream is not None:
             stream.end()

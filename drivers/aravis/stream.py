@@ -6,15 +6,11 @@ all are full, frames are lost and counted (underruns), and the camera's count of
 
 from __future__ import annotations
 
-import os
-import socket
-import stat
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +19,7 @@ from numpy.typing import NDArray
 from drivers.aravis.library import aravis, is_library_error
 from drivers.aravis.network import buffer_bytes
 from drivers.aravis.options import Options
+from drivers.aravis.sockets import set_receive_buffer
 
 POP_US = 20_000
 """The receiving thread looks this often whether it shall end"""
@@ -147,7 +144,7 @@ class Stream:
         stream.set_property("socket-buffer-size", buffer_bytes(self._payload, options.socket_buffer_frames))
         resend = library.GvStreamPacketResend
         # The library does so when the first packet is there: too late for the frame it belongs to.
-        _set_receive_buffer(int(stream.get_port()), buffer_bytes(self._payload, options.socket_buffer_frames))
+        set_receive_buffer(int(stream.get_port()), buffer_bytes(self._payload, options.socket_buffer_frames))
         stream.set_property("packet-resend", resend.ALWAYS if options.resend else resend.NEVER)
         stream.set_property("packet-request-ratio", REQUEST_RATIO)
         stream.set_property("packet-timeout", RESEND_WAIT_US)
@@ -192,19 +189,3 @@ class Stream:
             if is_library_error(error):  # the chunk is not in this frame
                 return None
             raise
-
-
-def _set_receive_buffer(port: int, size: int) -> None:
-    """Of this process's UDP socket at `port`, which the library keeps to itself."""
-    for entry in list(Path("/proc/self/fd").iterdir()):
-        try:
-            duplicate = os.dup(int(entry.name))
-        except OSError:  # the descriptor of the listing itself
-            continue
-        try:
-            if stat.S_ISSOCK(os.fstat(duplicate).st_mode):
-                with socket.socket(fileno=os.dup(duplicate)) as one:
-                    if one.family == socket.AF_INET and one.type == socket.SOCK_DGRAM and one.getsockname()[1] == port:
-                        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
-        finally:
-            os.close(duplicate)

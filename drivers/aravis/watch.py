@@ -56,7 +56,7 @@ class GvcpProbe:
         request = struct.pack(">BBHHHI", 0x42, 0x01, _READ_REGISTER, 4, self._number, CONTROL_PRIVILEGE)
         until = time.monotonic() + patience_s
         try:
-            self._socket.send(request)
+            self._send(request)
             while (left := until - time.monotonic()) > 0:
                 self._socket.settimeout(left)
                 answer = self._socket.recv(64)
@@ -75,6 +75,13 @@ class GvcpProbe:
     def close(self) -> None:
         """See `Probe`."""
         self._socket.close()
+
+    def _send(self, request: bytes) -> None:
+        """The first send after an answer that the port is closed only tells that answer."""
+        try:
+            self._socket.send(request)
+        except ConnectionRefusedError:
+            self._socket.send(request)
 
     @staticmethod
     def _check_privilege(value: int) -> None:

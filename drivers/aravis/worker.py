@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import queue
 import threading
+import traceback
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
@@ -38,6 +39,8 @@ class _Task(Generic[_T]):
             if work is not None:
                 self._result = work()
         except BaseException as error:  # noqa: BLE001  (handed to who waits, or logged)
+            # Whoever keeps the error must not keep the camera open by it: the frames hold the library's objects.
+            traceback.clear_frames(error.__traceback__)
             self._error = error
         self.done.set()
 

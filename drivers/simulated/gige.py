@@ -108,6 +108,10 @@ class GigeCamera:
         """Whether a client holds the control privilege."""
         return self._control.controller is not None
 
+    def true_start_ns(self, block: int) -> int:
+        """When the exposure of a block (its number on the wire) began: of the last ones since AcquisitionStart."""
+        return self._sensor.true_starts[block]
+
     def pulse(self, t_ns: int) -> None:
         """A rising edge on Line1."""
         self._sensor.pulse(t_ns)

@@ -30,6 +30,7 @@ from scanner.devices import Pixels
 
 BUSY = 0x8007
 LONGEST_WAIT_S = 0.1
+REMEMBERED = 1024
 AUTOMATIC_SHARE = 0.2
 """An automatic function that was left on makes exposures wander by this share"""
 LINE_WAIT_S = 0.001
@@ -103,6 +104,8 @@ class Sensor:
         self._own_line: Line | None = None
         self.dropped_triggers = 0
         """since the last start"""
+        self.true_starts: dict[int, int] = {}
+        """by block: start of the exposure, ns; the last REMEMBERED of them"""
         self._open = True
         self._line_seen_ns = 0
         self._warm_up()
@@ -261,6 +264,8 @@ class Sensor:
             self._shots.popleft()
             self._block = self._block % 0xFFFF + 1
             block = self._block
+            self.true_starts[block] = shot.start_ns
+            self.true_starts.pop(block - REMEMBERED, None)
         x, y, width, height = setting.region
         stamp = self._device_clock.ticks(shot.start_ns)
         picture = Picture(setting.pixel_format, width, height, x, y, stamp, bool(setting.chunks))
@@ -381,3 +386,4 @@ class Sensor:
         self._line_edges.clear()
         self._block = 0
         self.dropped_triggers = 0
+        self.true_starts = {}
