@@ -1,4 +1,4 @@
-"""Writes the pages of the reference that are made from the program itself: the command line and the rig file.
+"""Writes what is made from the program itself: the command line, the rig file, the trigger board's timing diagrams.
 
 `make docs` runs it; a test fails while a page differs from what it would write.
 """
@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,9 @@ from service.config import RigConfig
 from service.program import app
 
 HERE = Path(__file__).parent
+GOLDEN = HERE.parent / "tests" / "golden" / "trigger"
+DIAGRAMS = ("<!-- diagrams: begin -->\n", "<!-- diagrams: end -->")
+COLUMNS = 96
 
 CLI_HEAD = """# Command line
 
@@ -48,7 +52,55 @@ def pages() -> dict[Path, str]:
     return {
         HERE / "reference" / "cli.md": CLI_HEAD + "".join(_commands()),
         HERE / "reference" / "rig-file.md": RIG_HEAD + "".join(_tables(RigConfig, ())),
+        HERE / "reference" / "trigger-protocol.md": _with_diagrams(HERE / "reference" / "trigger-protocol.md"),
     }
+
+
+def _with_diagrams(page: Path) -> str:
+    """The page with the golden timing files drawn between its marks."""
+    before, rest = page.read_text(encoding="utf-8").split(DIAGRAMS[0])
+    after = rest.partition(DIAGRAMS[1])[2]
+    drawn = [_diagram(json.loads(path.read_text(encoding="utf-8"))) for path in sorted(GOLDEN.glob("*.json"))]
+    return before + DIAGRAMS[0] + "".join(drawn) + DIAGRAMS[1] + after
+
+
+def _diagram(golden: dict[str, Any]) -> str:
+    """One golden timing file: what is sent, and every line with edges over time."""
+    edges: dict[str, list[tuple[float, int]]] = {}
+    for step in golden["do"]:
+        if "edge" in step:
+            edges.setdefault(step["edge"], []).extend([(step["t"], 1), (step["t"] + 100, 0)])
+    times: list[float] = []
+    for pin in golden["pins"]:
+        times.append(pin["t"] + (times[pin["after"]] if "after" in pin else 0))
+        edges.setdefault(pin["pin"], []).append((times[-1], pin["level"]))
+    if not edges:
+        return ""
+    moments = [t for line in edges.values() for t, _ in line]
+    margin = (max(moments) - min(moments)) / 24
+    first, last = min(moments) - margin, max(moments) + margin
+    sent = [f"    {_said(step)}\n" for step in golden["do"] if "edge" not in step]
+    names = sorted(edges, key=("VSYNC", "EXT", "CAM1", "CAM2", "SYNC", "LED").index)
+    rows = [f"    {name:6}{_trace(edges[name], first, last)}\n" for name in names]
+    scale = f"    {'':6}{first / 1e3:.1f} ms".ljust(COLUMNS - 2) + f"{last / 1e3:.1f} ms\n"
+    return f"\n### {golden['title']}\n\n{golden['about']}\n\n" + "".join([*sent, "\n", *rows, scale])
+
+
+def _said(step: dict[str, Any]) -> str:
+    if "bytes" in step:
+        return f"{step['t'] / 1e3:9.3f} ms  bytes {step['bytes']}"
+    return f"{step['t'] / 1e3:9.3f} ms  {step['send']:28} {step['answer']}"
+
+
+def _trace(edges: list[tuple[float, int]], first: float, last: float) -> str:
+    """A level over time, a character a column; what is shorter than one shows as one."""
+    drawn, width = "", (last - first) / COLUMNS
+    for column in range(COLUMNS):
+        begin, end = first + column * width, first + (column + 1) * width
+        within = [level for t, level in edges if begin <= t < end]
+        before = [level for t, level in edges if t < begin]
+        drawn += "▔" if any(within) or (not within and before and before[-1]) else "▁"
+    return drawn
 
 
 def _commands() -> Iterator[str]:

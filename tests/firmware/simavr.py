@@ -77,7 +77,7 @@ def build(folder: Path) -> Simavr:
         pytest.skip(f"not run: {', '.join(MISSING)} missing; setup/packages-firmware.txt lists what these tests need")
     board = folder / "simavr_board"
     for command in (
-        ["make", "-s", "-C", FIRMWARE, f"BUILD={folder}", f"{folder}/trigger.elf"],
+        ["make", "-s", "-C", FIRMWARE, f"BUILD={folder}", "all"],
         ["cc", "-O2", "-Wall", "-Wextra", "-Werror", "-o", board, HERE / "simavr_board.c", "-lsimavr"],
     ):
         built = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
