@@ -41,7 +41,7 @@ class WireOptions:
 
     address: str = "127.0.0.2"
     serial: str = ""
-    """empty: made of the address"""
+    """empty: the address in hexadecimal digits"""
     user_name: str = ""
     loss: float = 0.0
     """share of packets that never arrive"""
@@ -152,7 +152,7 @@ class GigeCamera:
     def _power_up(self) -> None:
         wire, settings = self._wire, self._settings
         self._sockets = _sockets(wire.address, self.name)
-        serial = wire.serial or wire.address.replace(".", "")
+        serial = wire.serial or f"{int(ipaddress.IPv4Address(wire.address)):08X}"
         size = self.world.rig.calibration.camera.size
         registers = Registers(Identity(wire.address, serial, wire.user_name, wire.tick_hz), size)
         self._registers = registers
