@@ -208,6 +208,7 @@ case ${1:-tests} in
     build) build ;;
     run) shift; build; boot fast "$@" ;;
     boot) shift; build; boot systemd "$@" ;;
-    tests) build; compile_kernels; boot fast "$clone/.venv/bin/python" -m pytest -q -p no:cacheprovider tests/rig ;;
+    tests) build; compile_kernels; boot fast "$clone/.venv/bin/python" -m pytest -q -p no:cacheprovider \
+        tests/rig tests/contract/test_window.py ;;
     *) fail "no command '$1'; see the top of setup/rig.sh" ;;
 esac
