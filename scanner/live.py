@@ -10,16 +10,18 @@ import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from scanner.errors import ScannerError
-from scanner.geometry import Calibration, calibration_from_dict
 from scanner.session import Call
 from scanner.wire import TERMINAL_STATES, ErrorBody, LiveHeader, decode_live, error_from_body
+
+if TYPE_CHECKING:
+    from scanner.geometry import Calibration
 
 Map = NDArray[np.float32]
 
@@ -101,8 +103,6 @@ class LiveWatch:
         self.finished = False
         self.missed = 0
         """results and frames that this client did not get, in all"""
-        self.calibration: Calibration | None = None
-        """the rig's, once `state` has told it"""
         self._last = -1
 
     def result(self, data: bytes) -> LiveFrame | None:
@@ -131,9 +131,6 @@ class LiveWatch:
         if run is None or run["id"] != self.job_id:
             self.finished = True  # another one has begun since: this one is over
             return
-        lenses = run["live"].get("calibration")
-        if lenses is not None and self.calibration is None:
-            self.calibration = calibration_from_dict(lenses, name="the daemon's calibration")
         if run["state"] in TERMINAL_STATES:
             self.finished = True
         if run["state"] == "failed":

@@ -14,7 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import zmq.asyncio
@@ -310,22 +310,21 @@ class WorkerPool:
             series.deliveries += 1
             seat.delivery = delivery = Delivery(next(self._numbers), series)
             series.delivering(delivery.number)
-            sending = (
-                self._send_live(seat, delivery, series)
-                if isinstance(series, LiveSeries)
-                else self._send_series(seat, delivery, series)
-            )
-            delivery.sender = self._task(sending)
+            live = isinstance(series, LiveSeries)
+            delivery.sender = self._task(self._send_live(seat, delivery) if live else self._send_series(seat, delivery))
 
     def _next_for(self, seat: Seat) -> Series | LiveSeries | None:
-        """Of the series that wait the first that this worker can take: one that decodes nothing takes no live run."""
+        """Of the series that wait the first that this worker can take."""
+        # A live run is for one that decodes and may make a socket beside the daemon's: ours, where there are any.
+        may_publish = seat.ready.decode and (seat.ready.pid in self._children or not self._children)
         for series in self._parked:
-            if seat.ready.decode or not isinstance(series, LiveSeries):
+            if may_publish or not isinstance(series, LiveSeries):
                 self._parked.remove(series)
                 return series
         return None
 
-    async def _send_live(self, seat: Seat, delivery: Delivery, series: LiveSeries) -> None:
+    async def _send_live(self, seat: Seat, delivery: Delivery) -> None:
+        series = cast(LiveSeries, delivery.series)
         await self._deliver(seat, delivery, series.begin(delivery.number))
         while True:
             series.changed.clear()
@@ -336,7 +335,8 @@ class WorkerPool:
                 return
             await series.changed.wait()
 
-    async def _send_series(self, seat: Seat, delivery: Delivery, series: Series) -> None:
+    async def _send_series(self, seat: Seat, delivery: Delivery) -> None:
+        series = cast(Series, delivery.series)
         try:
             tail = RecordTail(series.capture, delivery.number)
         except StorageError as error:
