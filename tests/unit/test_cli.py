@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 import typer
 
+from drivers import registry
+from scanner.devices import DeviceInfo
 from scanner.patterns import PatternSequence, ProjectorSize
 from scanner.scan import load_scan
 from service import cli, program
-from service.commands import devices
 
 FRINGED = (sys.executable, "-c", "import sys; from service.cli import main; sys.exit(main())")
 COMMANDS = ("scan", "decode", "audit", "patterns", "devices", "check-config", "daemon", "worker", "status")
@@ -195,8 +196,24 @@ def test_devices_lists_the_simulated_rigs(run: Run) -> None:
     found = json.loads(out)["devices"]
     assert (status, err) == (0, "")
     assert {"camera", "projector"} <= {device["kind"] for device in found if device["driver"] == "simulated"}
-    assert devices.devices.__doc__
-    assert "simulated" in run("devices")[1]
+
+
+def test_devices_prints_the_piece_of_a_rig_file(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = [DeviceInfo("aravis", "maker-42", "camera", "Maker 42", {})]
+    monkeypatch.setattr("drivers.registry.discover", lambda: seen)
+    status, out, _ = run("devices")
+    assert status == 0
+    assert '[camera]\ndriver = "aravis"\ndevice = "maker-42"' in out
+    monkeypatch.setattr("drivers.registry.discover", list)
+    assert "fringed doctor" in run("devices")[1]
+
+
+def test_a_driver_that_cannot_look_costs_only_its_own_devices(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(registry, "driver_names", lambda kind: ["no-such-driver", "simulated"])
+    assert {device.driver for device in registry.discover()} == {"simulated"}
+    assert "no-such-driver cannot look for devices" in caplog.text
 
 
 def test_check_config_says_what_a_rig_file_means_or_all_that_is_wrong(run: Run, tmp_path: Path) -> None:
