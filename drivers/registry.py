@@ -109,6 +109,8 @@ def look(name: str) -> list[DeviceInfo]:
         ConfigError: no driver of this name, or it fails to load.
     """
     kinds = [kind for kind in _GROUPS if name in driver_names(kind)]
+    if not kinds:
+        raise ConfigError(f"no driver named {name!r}", hint=f"installed: {', '.join(sorted(driver_names('camera')))}")
     return [device for kind in kinds for device in _load(kind, name).discover()]
 
 
