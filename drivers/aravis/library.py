@@ -18,7 +18,7 @@ VERSIONS = ("0.8", "0.10")
 PACKAGES = "apt install gir1.2-aravis-0.8 python3-gi"
 
 USB_HINT = (
-    "udev/70-fringed.rules gives USB3 Vision cameras to the group fringed: install it, be a member of the group, "
+    "udev/70-fringed.rules gives USB3 Vision cameras to the group video: install it, be a member of the group, "
     "and plug the camera in again"
 )
 

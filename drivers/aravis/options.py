@@ -16,7 +16,7 @@ Pair = tuple[float, float]
 
 @dataclass(frozen=True)
 class Options:
-    """Every option has a default that works; `docs/how-to/connect-a-gige-camera.md` says when to change one."""
+    """Every option has a default that works; `docs/how-to/connect-a-gige-or-usb3-camera.md` says when to change one."""
 
     packet_size: int | None = field(default=None, metadata={"low": 576, "high": 65_000})
     """bytes on the wire, headers included; None: the largest that arrives whole"""

@@ -32,13 +32,19 @@ def gige(
         str, typer.Argument(metavar="RIG/SCENE", help="What it sees, as the simulated camera's device string.")
     ] = "casey2011/bust",
     address: Annotated[str, typer.Option(metavar="IP", help="Address of the first camera, 127.x.x.x.")] = "127.0.0.2",
-    count: Annotated[int, typer.Option(min=1, max=64, help="Cameras, at addresses that follow.")] = 1,
-    loss: Annotated[float, typer.Option(min=0.0, max=0.9, help="Share of packets that never arrive.")] = 0.0,
-    queue: Annotated[int, typer.Option(min=0, max=64, help="Triggers remembered while busy; 0: dropped.")] = 0,
+    count: Annotated[int, typer.Option(metavar="N", min=1, max=64, help="Cameras, at addresses that follow.")] = 1,
+    loss: Annotated[
+        float, typer.Option(metavar="SHARE", min=0.0, max=0.9, help="Share of packets that never arrive.")
+    ] = 0.0,
+    queue: Annotated[
+        int, typer.Option(metavar="N", min=0, max=64, help="Triggers remembered while busy; 0: dropped.")
+    ] = 0,
     link: Annotated[float, typer.Option(metavar="MBIT/S", min=0.0, help="Speed of the wire; 0: unlimited.")] = 0.0,
-    ring: Annotated[int, typer.Option(min=0, max=4096, help="Send so many prepared frames in turn: fast.")] = 0,
+    ring: Annotated[
+        int, typer.Option(metavar="N", min=0, max=4096, help="Send so many prepared frames in turn: fast.")
+    ] = 0,
     readout: Annotated[float, typer.Option(metavar="MS", min=0.01, max=1000.0, help="Duration of a readout.")] = 5.0,
-    shutter: Annotated[str, typer.Option(help="global or rolling")] = "global",
+    shutter: Annotated[str, typer.Option(metavar="global|rolling", help="How the sensor is read.")] = "global",
     light: Annotated[
         Path | None, typer.Option(metavar="PATH", help="Socket at which a simulated projector finds the camera.")
     ] = None,
