@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from service.commands import calibrate_solve, calibrate_target
+from service.commands import calibrate_solve, calibrate_sync, calibrate_target
 
 group = typer.Typer(
     help="Calibrate a rig: print a target, solve from captures of it, check the result.",
@@ -13,3 +13,4 @@ group = typer.Typer(
 )
 group.command("solve")(calibrate_solve.solve)
 group.command("target")(calibrate_target.target)
+group.command("sync")(calibrate_sync.sync)

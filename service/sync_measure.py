@@ -1,0 +1,101 @@
+"""How a rig's devices keep time, measured: latency, settling, jitter, pulsed greys, and the plan that follows.
+
+The words are for a person, the numbers for the rig file. Devices are opened here and given back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from scanner.clock import Clock
+from scanner.devices import Interval, ProjectorKind
+from scanner.errors import ConfigError, ScannerError
+from scanner.patterns import PatternSequence
+from scanner.sequencer import measure_latency
+from scanner.sequencer.light import Light, measure_light
+from service.config import RigConfig
+from service.scan_setup import OpenRig, default_pattern, open_rig
+
+ROUNDS = 3
+"""Searches for the light's begin and end, each with flips of its own: their union covers what jitters slowly"""
+
+
+@dataclass(frozen=True)
+class Sync:
+    """What was measured; intervals in ns."""
+
+    latency: Interval
+    settle: Interval
+    refresh_ns: int
+    light: Light
+    plan: dict[str, Any] | None
+    """of a default PMP scan with these values, as capture.json has it; None where nothing works"""
+    refused: str | None
+    """why nothing works, in words"""
+
+    def rig_lines(self) -> dict[str, list[int]]:
+        """Values for `[projector]`, whole microseconds, rounded outwards."""
+        return {
+            name: [interval.low_ns // 1000, -(-interval.high_ns // 1000)]
+            for name, interval in (("latency_us", self.latency), ("settle_us", self.settle))
+        }
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data."""
+        return {
+            **self.rig_lines(),
+            "refresh_ns": self.refresh_ns,
+            "light": vars(self.light),
+            "plan": self.plan,
+            "refused": self.refused,
+        }
+
+
+def measure_sync(config: RigConfig, clock: Clock, stage: Callable[[str], None]) -> Sync:
+    """Open a rig's devices and measure.
+
+    Raises:
+        ConfigError: the projector cannot flip.
+        SyncError: black and white cannot be told apart.
+        DeviceError: a device cannot be opened, or failed.
+    """
+    stage("opening devices")
+    opened = open_rig(config.model_dump(mode="json"), clock)
+    try:
+        capabilities = opened.rig.projector.capabilities
+        if capabilities.kind is not ProjectorKind.FRAMEBUFFER:
+            raise ConfigError(
+                f"a {capabilities.kind.value} projector is not flipped by the host: there is no latency to measure",
+                device=opened.rig.projector.name,
+            )
+        found = []
+        for n in range(ROUNDS):
+            stage(f"measuring latency, round {n + 1} of {ROUNDS}")
+            rig = opened.rig
+            found.append(
+                measure_latency(rig.projector, rig.camera, clock, settings=rig.settings, trigger_mode=rig.trigger_mode)
+            )
+        latency, settle = _union([one for one, _ in found]), _union([two for _, two in found])
+        stage("measuring light")
+        rig = opened.rig
+        light = measure_light(rig.projector, rig.camera, clock, settings=rig.settings, trigger_mode=rig.trigger_mode)
+        plan, refused = _plan(opened, latency, settle)
+        return Sync(latency, settle, capabilities.refresh_ns, light, plan, refused)
+    finally:
+        opened.close()
+
+
+def _union(intervals: list[Interval]) -> Interval:
+    return Interval(min(i.low_ns for i in intervals), max(i.high_ns for i in intervals))
+
+
+def _plan(opened: OpenRig, latency: Interval, settle: Interval) -> tuple[dict[str, Any] | None, str | None]:
+    pattern = default_pattern("pmp", ("y",), "y", opened.projector)
+    sequence = PatternSequence.bracketed(opened.projector, pattern)
+    rig = replace(opened.rig, latency=latency, settle=settle)
+    try:
+        return rig.plan(sequence).as_dict(), None
+    except ScannerError as error:
+        return None, f"{error}{f' ({error.hint})' if error.hint else ''}"
