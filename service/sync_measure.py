@@ -96,6 +96,8 @@ def _plan(opened: OpenRig, latency: Interval, settle: Interval) -> tuple[dict[st
     sequence = PatternSequence.bracketed(opened.projector, pattern)
     rig = replace(opened.rig, latency=latency, settle=settle)
     try:
-        return rig.plan(sequence).as_dict(), None
+        asked = opened.exposure
+        exposure_ns = round(1000 * asked) if isinstance(asked, int | float) else None
+        return rig.plan(sequence, exposure_ns=exposure_ns).as_dict(), None
     except ScannerError as error:
         return None, f"{error}{f' ({error.hint})' if error.hint else ''}"
