@@ -76,8 +76,10 @@ def rms(residuals: NDArray[Any]) -> float:
     return float(np.sqrt((np.asarray(residuals) ** 2).sum(axis=-1).mean()))
 
 
-def _covariance(solution: Solution) -> dict[str, Any]:
+def _covariance(solution: Solution) -> dict[str, Any] | None:
     part = solution.adjusted.covariance[:RIG_PARAMETERS, :RIG_PARAMETERS]
+    if not np.isfinite(part).all():
+        return None
     return {
         "parameters": list(NAMES[:RIG_PARAMETERS]),
         "units": "px, 1, rad (rotation vector), mm",

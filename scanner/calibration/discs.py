@@ -25,6 +25,8 @@ Found = tuple[NDArray[np.int64], Array, Array]
 RAYS = 64
 INSIDE, OUTSIDE = 0.6, 1.5
 """Radii, in units of the rim's, between which a ray is followed: beyond them there is one level each."""
+PLAIN_INSIDE, PLAIN_OUTSIDE = 0.8, 1.2
+"""Radii up to which only the disc is seen, and from which only its ground."""
 PASSES = 3
 MOST_MISFIT = 0.15
 """Of rim points from their ellipse, as a share of its radius (median): beyond, it is no disc."""
@@ -218,9 +220,9 @@ def _rim(picture: NDArray[np.float32], centre: Array, rays: Array) -> Array | No
     height, width = picture.shape
     if where.min() < 0 or where[..., 0].max() > width - 1 or where[..., 1].max() > height - 1:
         return None
-    profile = map_coordinates(picture, [where[..., 1].ravel(), where[..., 0].ravel()], order=1).reshape(
-        count, len(rays)
-    )
+    levels = map_coordinates(picture, [where[..., 1].ravel(), where[..., 0].ravel()], order=1)
+    shaded: Array = levels.astype(np.float64).reshape(count, len(rays))
+    profile = _evenly_lit(shaded, at, where - centre, longest)
     ends = max(count // 8, 1)
     inside, outside = profile[:ends].mean(axis=0), profile[-ends:].mean(axis=0)
     change = inside - outside
@@ -234,6 +236,24 @@ def _rim(picture: NDArray[np.float32], centre: Array, rays: Array) -> Array | No
         return None
     radius = INSIDE + (OUTSIDE - INSIDE) * share[good]
     return np.asarray(centre + radius[:, None] * rays[good], dtype=np.float64)
+
+
+def _evenly_lit(profile: Array, at: Array, where: Array, longest: float) -> Array:
+    """Grey levels along rays with the light's slope over the disc taken out.
+
+    Light that falls off to one side makes every rim point drift to the same side: 1 % over a radius is a tenth of a
+    pixel. The slope is common to the disc and to its ground (their levels' logarithms on two parallel planes).
+    """
+    inner, outer = at < PLAIN_INSIDE, at > PLAIN_OUTSIDE
+    samples = inner | outer
+    levels = profile[samples]
+    if not (levels > 0).all():
+        return profile
+    x, y = where[samples, :, 0].ravel() / longest, where[samples, :, 1].ravel() / longest
+    is_inner = np.repeat(inner[samples], profile.shape[1]).astype(np.float64)
+    terms = np.column_stack((is_inner, 1 - is_inner, x, y))
+    slope = np.linalg.lstsq(terms, np.log(levels).ravel(), rcond=None)[0][2:]
+    return np.asarray(profile / np.exp(where @ slope / longest), dtype=np.float64)
 
 
 def _local_affine(homography: Array, points: Array) -> Array:

@@ -7,6 +7,7 @@ dissertation, and as the start of the adjustment.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +71,30 @@ def project_hall(matrix: Array, points: Array) -> Array:
     return np.asarray(homogeneous[..., :2] / homogeneous[..., 2:], dtype=np.float64)
 
 
+def triangulate_hall(camera: Array, projector: Array, rows: NDArray[Any]) -> Array:
+    """World points from rows alone (Casey 2011, sec. 3.5, eqs. 4.35-4.37): three equations for X, Y, Z at each pixel.
+
+    Args:
+        camera, projector: (3, 4) Hall matrices.
+        rows: (H, W) projector rows, px; NaN = not measured.
+
+    Returns:
+        (H, W, 3) float64 mm in the world's frame, NaN where not measured or where the equations are singular.
+    """
+    y, x = np.nonzero(np.isfinite(rows))
+    measured = np.asarray(rows, dtype=np.float64)[y, x]
+    # (a, b, c) . point = (p, q, r), by Cramer's rule: a million 3 x 3 systems at once.
+    a, p = _equation(camera[0] - x[:, None] * camera[2])
+    b, q = _equation(camera[1] - y[:, None] * camera[2])
+    c, r = _equation(projector[1] - measured[:, None] * projector[2])
+    bc = np.cross(b, c)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = (p * bc + q * np.cross(c, a) + r * np.cross(a, b)) / (a * bc).sum(axis=1, keepdims=True)
+    points = np.full((*rows.shape, 3), np.nan)
+    points[y, x] = np.where(np.isfinite(found).all(axis=1, keepdims=True), found, np.nan)
+    return points
+
+
 def decompose(matrix: Array) -> Decomposed:
     """A Hall matrix as focal lengths, principal point, rotation and translation.
 
@@ -89,6 +114,11 @@ def decompose(matrix: Array) -> Decomposed:
         rotation, scale = -rotation, -scale
     translation = np.linalg.solve(upper, matrix[:, 3]) * np.sign(scale)
     return Decomposed(upper / upper[2, 2], rotation, translation)
+
+
+def _equation(plane: Array) -> tuple[Array, Array]:
+    """(N, 3) normals and (N, 1) right-hand sides of planes (N, 4)."""
+    return plane[:, :3], -plane[:, 3:]
 
 
 def _normaliser(points: Array) -> tuple[Array, Array]:

@@ -142,7 +142,7 @@ def solve(
         projector_size,
         tuple(views),
         _priors(options, target),
-        _length(options, target),
+        stated_length(options, target),
     )
     problem, adjusted = _without_bad_views(problem, begun.state, out)
     check_state(problem, adjusted)
@@ -240,7 +240,12 @@ def _priors(options: SolveOptions, target: Target) -> Priors:
     return Priors(sheet_scale=1e-7, sheet_bow=1e-7)
 
 
-def _length(options: SolveOptions, target: Target) -> Length | None:
+def stated_length(options: SolveOptions, target: Target) -> Length | None:
+    """The length that was stated, checked against the target.
+
+    Raises:
+        CalibrationError: it is more than 5 % off.
+    """
     if options.length is None:
         return None
     mm, sigma = options.length

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +22,13 @@ TARGET_HELP = (
 )
 
 
+class Model(StrEnum):
+    """What is fitted."""
+
+    PINHOLE = "pinhole"
+    HALL = "hall"
+
+
 Replace = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
 
 
@@ -31,6 +40,10 @@ def solve(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FILE", parser=output_path, help="Calibration file to write.")
     ],
+    model: Annotated[
+        Model,
+        typer.Option(metavar="pinhole|hall", help="Lenses with distortion, or the dissertation's 3 x 4 matrices."),
+    ] = Model.PINHOLE,
     length: Annotated[
         str | None,
         typer.Option(
@@ -70,6 +83,7 @@ def solve(
       fringed calibrate solve poses/ --target chessboard:9x6:30 -o rig.json
       fringed calibrate solve p1 p2 p3 p4 --target charuco:10x7:30 --length 240.1:0.05 -o rig.json
       fringed calibrate solve poses/ --target chessboard:9x6:30 --baseline 240 -o rig.json --json
+      fringed calibrate solve wedge/ --target wedge:wedge.json --model hall -o rig.json
     """
     stated = None if length is None else _length(length)
     drawing = output.with_suffix(".png") if picture else None
@@ -82,7 +96,8 @@ def solve(
         from scanner.calibration.calibration_file import as_text, calibration_dict  # noqa: PLC0415
         from scanner.calibration.observe import find_captures, observe  # noqa: PLC0415
         from scanner.calibration.solve import SolveOptions  # noqa: PLC0415
-        from scanner.calibration.solve import solve as solve_rig  # noqa: PLC0415
+        from scanner.calibration.solve import solve as solve_pinhole  # noqa: PLC0415
+        from scanner.calibration.solve_hall import solve_hall  # noqa: PLC0415
         from scanner.calibration.targets import parse_target  # noqa: PLC0415
         from scanner.storage import replace_file  # noqa: PLC0415
 
@@ -93,6 +108,7 @@ def solve(
             paths, looked_for, lambda done, total: lines.advance(done, total, f"{done} of {total} captures")
         )
         options = SolveOptions(stated, rigid, baseline, distance, warm_up)
+        solve_rig = solve_hall if model == Model.HALL else solve_pinhole
         solution = solve_rig(looked_for, observations, options, left_out, lines.stage)
         content = calibration_dict(solution)
         lines.stage("writing")
@@ -154,12 +170,12 @@ def _facts(
         facts.append(
             (
                 side,
-                f"focal {m[0, 0]:.2f} +- {s[0]:.2f}, {m[1, 1]:.2f} +- {s[1]:.2f} px; "
-                f"axis at {m[0, 2]:.2f} +- {s[2]:.2f}, {m[1, 2]:.2f} +- {s[3]:.2f} px",
+                f"focal {_stated(m[0, 0], s[0])}, {_stated(m[1, 1], s[1])} px; "
+                f"axis at {_stated(m[0, 2], s[2])}, {_stated(m[1, 2], s[3])} px",
             )
         )
     shift, s = state.translation, spread["translation"]
-    facts.append(("translation", ", ".join(f"{v:.3f} +- {e:.3f}" for v, e in zip(shift, s, strict=True)) + " mm"))
+    facts.append(("translation", ", ".join(_stated(v, e, 3) for v, e in zip(shift, s, strict=True)) + " mm"))
     residuals = content["residuals"]
     for name in ("camera", "projector", "epipolar"):
         facts.append((f"rms {name}", f"{residuals[f'{name}_px']:.4f} px"))
@@ -171,6 +187,11 @@ def _facts(
     )
     facts.append(("file", output))
     return facts if drawing is None else [*facts, ("picture", drawing)]
+
+
+def _stated(value: float, sigma: float, digits: int = 2) -> str:
+    """A value with its 1-sigma, where that is known."""
+    return f"{value:.{digits}f}" + ("" if math.isnan(sigma) else f" +- {sigma:.{digits}f}")
 
 
 def _cell(value: Any) -> str:

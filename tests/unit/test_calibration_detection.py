@@ -40,7 +40,7 @@ def test_corners_are_measured_to_hundredths_of_a_pixel(spec: str) -> None:
 @pytest.mark.parametrize("dark", [True, False])
 def test_discs_are_where_perspective_puts_their_ellipses(spec: str, dark: bool) -> None:
     target = parse_target(spec)
-    found = detect(drawn(target) if dark else 260 - drawn(target), target)
+    found = detect(drawn(target, 60, 220) if dark else drawn(target, 200, 50), target)
     assert isinstance(found, Detection)
     rotation = np.asarray(cv2.Rodrigues(POSE[0])[0])
     centres = target.points @ rotation.T + POSE[1]
@@ -240,24 +240,24 @@ def seen(target: Target) -> np.ndarray:
     return CAMERA.project(target.points @ np.asarray(cv2.Rodrigues(POSE[0])[0]).T + POSE[1])
 
 
-def drawn(target: Target) -> np.ndarray:
-    """A picture of the target in the standard pose: dark on white, shaded, blurred by lens and pixel."""
+def drawn(target: Target, ink: int = 60, paper: int = 220) -> np.ndarray:
+    """A picture of the target in the standard pose: ink on paper, shaded, blurred by lens and pixel."""
     scale = 8.0  # px a mm
     half = np.array(target.half_extent) + target.spacing_mm * 1.5
-    flat = np.full((2 * half[::-1] * scale).astype(int), 220, np.uint8)
+    flat = np.full((2 * half[::-1] * scale).astype(int), paper, np.uint8)
     if target.discs:
         for x, y, _ in target.points:
             centre = ((np.array([x, y]) + half) * scale * 16 - 8).round().astype(int)
-            cv2.circle(flat, centre.tolist(), round(target.diameter_mm / 2 * scale * 16), 60, -1, cv2.LINE_AA, 4)
+            cv2.circle(flat, centre.tolist(), round(target.diameter_mm / 2 * scale * 16), ink, -1, cv2.LINE_AA, 4)
     else:
         squares = (target.columns, target.rows) if target.kind == "charuco" else (target.columns + 1, target.rows + 1)
         side = round(target.spacing_mm * scale)
         if target.kind == "charuco":
             board = charuco_board(target).generateImage((squares[0] * side, squares[1] * side))
-            board = np.where(board < 128, 60, 220).astype(np.uint8)
+            board = np.where(board < 128, ink, paper).astype(np.uint8)
         else:
             y, x = np.indices((squares[1] * side, squares[0] * side)) // side
-            board = np.where((x + y) % 2 == 0, 60, 220).astype(np.uint8)
+            board = np.where((x + y) % 2 == 0, ink, paper).astype(np.uint8)
         top, left = (np.array(flat.shape) - board.shape) // 2
         flat[top : top + board.shape[0], left : left + board.shape[1]] = board
     rotation = np.asarray(cv2.Rodrigues(POSE[0])[0])
@@ -311,7 +311,8 @@ def wedge(folder: Path) -> Target:
 def _sampled(large: np.ndarray) -> np.ndarray:
     blurred = cv2.GaussianBlur(large.astype(np.float32), (0, 0), 0.7 * FINE)
     small = blurred.reshape(SIZE[1], FINE, SIZE[0], FINE).mean(axis=(1, 3))
-    shade = np.linspace(1.0, 0.8, SIZE[0])[None]
+    # Light that falls off to the right by a half: a disc of 40 px is 3 % darker on one side.
+    shade = np.linspace(1.0, 0.5, SIZE[0])[None]
     noise = np.random.default_rng(0).normal(0, 0.4, small.shape)
     return (small * shade + noise).astype(np.float32)
 

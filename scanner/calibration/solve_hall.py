@@ -1,0 +1,206 @@
+"""The dissertation's own calibration: the Hall model of camera and projector from one scan of a target in space.
+
+Points of a wedge (secs. 3.4 and 3.6), or of flat targets in poses that an adjustment has found, give two matrices by
+pseudo-inverse. They are written as they are, and as the lenses, rotation and translation that they are made of, so
+that every other part of the program can use them: a Hall matrix is a pinhole lens with skew and without distortion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.calibration.adjustment import Adjusted
+from scanner.calibration.discs import eccentricity
+from scanner.calibration.hall import decompose, hall_matrix, project_hall
+from scanner.calibration.lens_slopes import rotation_of, vector_of
+from scanner.calibration.observe import LeftOut, Observation
+from scanner.calibration.plausibility import Facing, check_facing
+from scanner.calibration.problem import POSES, Priors, Problem, State, View
+from scanner.calibration.solve import Progress, Solution, SolveOptions, epipolar_errors, solve, stated_length
+from scanner.calibration.targets import FEWEST_DISCS, Target
+from scanner.errors import CalibrationError
+from scanner.geometry import Lens
+
+Array = NDArray[np.float64]
+
+DISC_ROUNDS = 3
+"""Of fit and the discs' eccentricity in turn."""
+DISTORTED_PX = 0.1
+"""Residual from which distortion is the likely cause: points are measured to some hundredths."""
+MOST_RMS_SHARE = 0.002
+"""Of the picture's width that residuals may have: beyond, points and model do not belong together."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Both matrices and the view they were fitted to, its points corrected for perspective."""
+
+    camera: Array
+    projector: Array
+    view: View
+
+
+def solve_hall(
+    target: Target,
+    observations: Sequence[Observation],
+    options: SolveOptions | None = None,
+    left_out: Sequence[LeftOut] = (),
+    progress: Progress | None = None,
+) -> Solution:
+    """Calibrate with the Hall model.
+
+    Of a target in space the capture that shows most points is used, and its frame is the world's. A flat target is
+    solved by the adjustment first, and the matrices are fitted to all its poses, the camera's frame being the world's.
+
+    Raises:
+        CalibrationError: too few points, or a result that cannot be.
+    """
+    if target.flat:
+        return _of_poses(solve(target, observations, options, left_out, progress, hold_out=False))
+    if not observations:
+        why = left_out[0].reason if left_out else "no capture was given"
+        raise CalibrationError(f"no capture shows the target: {why}", hint="capture the target, both axes")
+    chosen = max(observations, key=lambda one: len(one.view.ids))
+    if len(chosen.view.ids) < FEWEST_DISCS:
+        raise CalibrationError(f"{len(chosen.view.ids)} discs are seen, the Hall model is given {FEWEST_DISCS} or more")
+    facing, _ = check_facing([chosen.view])
+    fit = _fitted(target, chosen.view)
+    state, world = _parts(fit, chosen)
+    length = stated_length(options or SolveOptions(), target)
+    problem = Problem(target, chosen.camera_size, chosen.projector_size, (fit.view,), Priors(), length)
+    points = target.points[fit.view.ids]
+    adjusted = _as_adjusted(state, problem, (fit.camera, fit.projector), [points])
+    _check(adjusted, problem)
+    others = [LeftOut(one.view.name, "one capture is enough") for one in observations if one is not chosen]
+    created = (chosen.created, chosen.created)
+    hall = {"camera": fit.camera.tolist(), "projector": fit.projector.tolist()}
+    return Solution(
+        target,
+        options or SolveOptions(),
+        problem,
+        adjusted,
+        facing,
+        np.array([np.nan]),
+        epipolar_errors(problem, state),
+        (*left_out, *others),
+        tuple(_warnings(facing, adjusted)),
+        chosen.response,
+        created,
+        {"hall": hall, "world": world},
+    )
+
+
+def _of_poses(solution: Solution) -> Solution:
+    """The Hall matrices of a solution from flat targets."""
+    problem, state = solution.problem, solution.state
+    space = [
+        problem.target.points[view.ids] @ rotation_of(pose[:3]).T + pose[3:]
+        for view, pose in zip(problem.views, state.poses, strict=True)
+    ]
+    every = np.concatenate(space)
+    camera = hall_matrix(every, np.concatenate([view.camera for view in problem.views]))
+    projector = hall_matrix(every, np.concatenate([view.projector for view in problem.views]))
+    parts = [decompose(matrix) for matrix in (camera, projector)]
+    rotation, translation = _between(*((part.rotation, part.translation) for part in parts))
+    lenses = [
+        Lens(size, part.matrix, np.zeros(5))
+        for size, part in zip((problem.camera_size, problem.projector_size), parts, strict=True)
+    ]
+    # Poses stand in the Hall camera's frame, which need not be the adjusted one's.
+    first = parts[0]
+    poses = np.array(
+        [
+            [*vector_of(first.rotation @ rotation_of(pose[:3])), *(first.rotation @ pose[3:] + first.translation)]
+            for pose in state.poses
+        ]
+    )
+    moved = State(lenses[0], lenses[1], rotation, translation, state.sheet, poses)
+    adjusted = _as_adjusted(moved, problem, (camera, projector), space)
+    _check(adjusted, problem)
+    world = {"rotation": first.rotation.T.tolist(), "translation": (-first.rotation.T @ first.translation).tolist()}
+    hall = {"camera": camera.tolist(), "projector": projector.tolist()}
+    return replace(
+        solution,
+        adjusted=adjusted,
+        epipolar=epipolar_errors(problem, moved),
+        extra={"hall": hall, "world": world},
+        warnings=(*solution.warnings, *_warnings(None, adjusted)),
+    )
+
+
+def _fitted(target: Target, seen: View) -> _Fit:
+    points, view = target.points[seen.ids], seen
+    rounds = DISC_ROUNDS if target.normals is not None else 0
+    camera = hall_matrix(points, view.camera)
+    for _ in range(rounds):
+        assert target.normals is not None  # noqa: S101  else there are no rounds
+        project = partial(project_hall, camera)
+        moved = eccentricity(points, target.normals[seen.ids], target.diameter_mm / 2, project)
+        shifted = (seen.slope @ moved[..., None])[..., 0]
+        view = replace(seen, camera=seen.camera - moved, projector=seen.projector - shifted)
+        camera = hall_matrix(points, view.camera)
+    return _Fit(camera, hall_matrix(points, view.projector), view)
+
+
+def _parts(fit: _Fit, observation: Observation) -> tuple[State, dict[str, list[float]]]:
+    """Both matrices as lenses and poses, and where the world is: X_world = rotation @ X_camera + translation."""
+    camera, projector = decompose(fit.camera), decompose(fit.projector)
+    rotation, translation = _between((camera.rotation, camera.translation), (projector.rotation, projector.translation))
+    pose = np.concatenate((vector_of(camera.rotation), camera.translation))
+    state = State(
+        Lens(observation.camera_size, camera.matrix, np.zeros(5)),
+        Lens(observation.projector_size, projector.matrix, np.zeros(5)),
+        rotation,
+        translation,
+        np.array([1.0, 1.0, 0.0]),
+        pose[None],
+    )
+    back = camera.rotation.T
+    return state, {"rotation": back.tolist(), "translation": (-back @ camera.translation).tolist()}
+
+
+def _between(camera: tuple[Array, Array], projector: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Rotation and translation from camera to projector, from both of the world's."""
+    rotation = projector[0] @ camera[0].T
+    return rotation, projector[1] - rotation @ camera[1]
+
+
+def _as_adjusted(state: State, problem: Problem, matrices: tuple[Array, Array], space: Sequence[Array]) -> Adjusted:
+    camera = tuple(v.camera - project_hall(matrices[0], p) for v, p in zip(problem.views, space, strict=True))
+    projector = tuple(v.projector - project_hall(matrices[1], p) for v, p in zip(problem.views, space, strict=True))
+    kept = tuple(np.ones(len(view.ids), dtype=bool) for view in problem.views)
+    unknown = np.full((POSES, POSES), np.nan)
+    spread = float(np.sqrt((np.concatenate(camera) ** 2).mean()))
+    return Adjusted(state, unknown, camera, projector, kept, spread, float("nan"), float("nan"))
+
+
+def _warnings(facing: Facing | None, adjusted: Adjusted) -> list[str]:
+    found = [] if facing is None or facing.words is None else [facing.words]
+    left = float(np.sqrt((np.concatenate(adjusted.camera_residuals) ** 2).sum(axis=1).mean()))
+    if left > DISTORTED_PX:
+        found.append(f"{left:.2f} px are left in the camera: the Hall model knows no distortion (--model pinhole does)")
+    return found
+
+
+def _check(adjusted: Adjusted, problem: Problem) -> None:
+    for side, size, residuals in (
+        ("camera", problem.camera_size, adjusted.camera_residuals),
+        ("projector", problem.projector_size, adjusted.projector_residuals),
+    ):
+        rms = float(np.sqrt((np.concatenate(residuals) ** 2).sum(axis=1).mean()))
+        if not rms <= MOST_RMS_SHARE * size[0]:
+            raise CalibrationError(
+                f"the Hall model does not fit these points: {rms:.1f} px are left in the {side}",
+                hint="check the target's file against the target; a lens with strong distortion needs --model pinhole",
+            )
+    depth = adjusted.state.poses[:, 5]
+    if (depth <= 0).any():
+        raise CalibrationError(
+            "the target comes out behind the camera: its picture is mirrored against its coordinates",
+            hint="check the handedness of the target's file: x right, y down, z away from the viewer, or a turn of it",
+        )
