@@ -9,14 +9,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drivers.aravis import camera_driver
-from drivers.registry import open_projector
+from drivers.registry import open_projector, open_trigger
 from drivers.simulated.gige_serve import GigeService
 from scanner.clock import MonotonicClock
 from scanner.devices import Projector, TriggerMode
@@ -24,6 +24,7 @@ from scanner.errors import ConfigError, DeviceNotFound
 from scanner.geometry import load_calibration
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence
 from scanner.sequencer import FinishReason, Rig, acquire
+from scanner.sequencer.plan import Mode
 from tests.unit.sequencer_bench import QUICK, MemorySink, Taken, pmp, take
 
 pytest.importorskip("gi", reason="cameras behind Aravis need python3-gi (setup/packages.txt)")
@@ -44,23 +45,28 @@ def projector(folder: Path, device: str = "quick/board?seed=1") -> Projector:
     return open_projector("simulated", device, {"camera_socket": str(folder / "light")}, MonotonicClock())
 
 
-def scanned(folder: Path, sequence: PatternSequence, repeat: int = 1) -> Taken:
-    """A run of a sequence through Aravis."""
-    clock = MonotonicClock()
-    with service(folder) as it:
-        shown = open_projector("simulated", "quick/board?seed=1", {"camera_socket": str(folder / "light")}, clock)
-        camera = camera_driver.open(ADDRESS, {"packet_size": 9000}, clock)
+def scanned(folder: Path, sequence: PatternSequence, *, repeat: int = 1, board: bool = False) -> Taken:
+    """A run of a sequence through Aravis. board: a simulated trigger board is wired to the camera's line."""
+    clock, device = MonotonicClock(), "quick/board?seed=1"
+    options = {"packet_size": 9000, "line_latency_us": [5.0, 12.0]}
+    with service(folder, device) as it, ExitStack() as opened:
+        shown = open_projector("simulated", device, {"camera_socket": str(folder / "light")}, clock)
+        opened.callback(shown.close)
+        trigger = open_trigger("simulated", device, {}, clock) if board else None
+        if trigger is not None:
+            opened.callback(trigger.close)
+        camera = camera_driver.open(ADDRESS, options, clock)
         try:
-            rig = Rig(shown, camera)
+            rig = Rig(shown, camera, trigger)
             sink = MemorySink()
-            made = rig.plan(sequence, exposure_ns=EXPOSURE_NS, repeat=repeat)
+            exposure_ns = 8_000_000 if board else EXPOSURE_NS
+            made = rig.plan(sequence, exposure_ns=exposure_ns, repeat=repeat)
             acquisition = acquire(rig, made, sequence, sink, clock)
             caps = camera.capabilities
             truth = it.cameras[0].world.view.truth
             return Taken(acquisition, sequence, sink, truth, CameraFormat(caps.width, caps.height, caps.bits))
         finally:
             camera.close()
-            shown.close()
 
 
 def test_pmp_through_the_wire_is_as_good_as_the_direct_path(tmp_path: Path) -> None:
@@ -70,6 +76,15 @@ def test_pmp_through_the_wire_is_as_good_as_the_direct_path(tmp_path: Path) -> N
     assert wire.acquisition.report()["verdicts"]["proved"] == len(sequence)
     ours, theirs = (float(np.sqrt(np.mean(np.square(each.error_px())))) for each in (wire, direct))
     assert ours <= 1.1 * theirs
+
+
+def test_a_trigger_board_fires_the_camera_on_the_wire(tmp_path: Path) -> None:
+    sequence = pmp(shifts=(4, 4))
+    wire = scanned(tmp_path, sequence, board=True)
+    assert wire.acquisition.plan.mode is Mode.HARDWARE
+    assert wire.acquisition.reason is FinishReason.COMPLETED
+    assert wire.acquisition.report()["verdicts"]["proved"] == len(sequence)
+    assert wire.acquisition.retakes == 0
 
 
 def test_mcp_through_the_wire(tmp_path: Path) -> None:
