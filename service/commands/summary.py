@@ -43,17 +43,24 @@ def report_result(folder: Path, seconds: float, stages: Mapping[str, float], *, 
 
 def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     facts = []
-    if (lit := (report.get("coverage") or {}).get("lit")) is not None:
-        facts.append(("coverage", f"{lit:.1%} of lit pixels"))
+    coverage = report.get("coverage") or {}
+    if (lit := coverage.get("lit")) is not None:
+        kept = coverage.get("points_of_lit") if report.get("depth_mm") or report.get("removed") else None
+        points = f", {kept:.1%} keep a point" if kept is not None and round(kept, 3) != round(lit, 3) else ""
+        facts.append(("coverage", f"{lit:.1%} of lit pixels{points}"))
     spread = report.get("depth_mm") or {}
     if (near := spread.get("p1")) is not None and (far := spread.get("p99")) is not None:
         facts.append(("depth", f"{near:.1f} .. {far:.1f} mm (1st to 99th percentile)"))
     if removed := {name: count for name, count in (report.get("removed") or {}).items() if count}:
         facts.append(("filtered", ", ".join(f"{count:,} {name}" for name, count in removed.items())))
-    inside = (report.get("truth") or {}).get("inside") or {}
+    truth = report.get("truth") or {}
+    inside = truth.get("inside") or {}
     error = inside.get("depth_mm") or {}
     if (rms := error.get("rms")) is not None and (p99 := error.get("p99")) is not None:
-        facts.append(("depth error", f"{rms:.3f} mm rms, {p99:.3f} mm in 99 of 100 points"))
+        away = f" ({truth['inside_px']} px and more from edges)" if "inside_px" in truth else ""
+        facts.append(("depth error", f"{rms:.3f} mm rms, {p99:.3f} mm in 99 of 100 points{away}"))
     if (wrong := inside.get("wrong")) is not None:
-        facts.append(("wrong", f"{wrong:,} points on a wrong fringe or stripe"))
+        everywhere = (truth.get("lit") or {}).get("wrong")
+        more = f"; {everywhere:,} with those at edges" if everywhere not in (None, wrong) else ""
+        facts.append(("wrong", f"{wrong:,} points on a wrong fringe or stripe{more}"))
     return facts

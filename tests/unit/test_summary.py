@@ -24,3 +24,19 @@ def test_a_report_without_points_is_printed(tmp_path: Path, capsys: pytest.Captu
 def test_frame_numbers_are_shortened() -> None:
     assert listed([4, 3, 5, 9, 11, 12]) == "3..5, 9, 11, 12"
     assert listed([]) == ""
+
+
+def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    depth = {"rms": 0.07, "p99": 0.2}
+    report = {
+        "points": 9,
+        "coverage": {"lit": 0.99, "points_of_lit": 0.2},
+        "depth_mm": {"p1": 1.0, "p99": 2.0},
+        "truth": {"inside_px": 7, "inside": {"depth_mm": depth, "wrong": 0}, "lit": {"wrong": 12}},
+    }
+    (tmp_path / "report.json").write_text(json.dumps(report), encoding="utf-8")
+    report_result(tmp_path, 1.0, {}, as_json=False)
+    printed = capsys.readouterr().out
+    assert "99.0% of lit pixels, 20.0% keep a point" in printed
+    assert "(7 px and more from edges)" in printed
+    assert "0 points on a wrong fringe or stripe; 12 with those at edges" in printed
