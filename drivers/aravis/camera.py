@@ -18,6 +18,7 @@ from typing import Any
 from drivers.aravis import settings as camera_settings
 from drivers.aravis import triggers
 from drivers.aravis.link import Link
+from drivers.aravis.network import Finding, check_network
 from drivers.aravis.options import Options
 from drivers.aravis.pixels import unpacked
 from drivers.aravis.stream import Received, Stream
@@ -62,6 +63,7 @@ class AravisCamera:
         self._next_clock_ns = 0
         self._losses = 0
         self._counted = False
+        self._doubted = False
         self._ended_counts: Mapping[str, int] = {}
         self._finder: threading.Thread | None = None
         self._closing = threading.Event()
@@ -117,7 +119,7 @@ class AravisCamera:
             raise ConfigError(f"no trigger mode {mode.value!r} on this camera", device=self._name, hint=f"it has {has}")
         link = self._present_link()
         link.call(lambda: self._begin(link, mode))
-        self._ids = _Unwrapped()
+        self._ids, self._doubted = _Unwrapped(), False
         self._mode = mode
 
     def trigger(self) -> None:
@@ -149,6 +151,8 @@ class AravisCamera:
                 raise link.loss()
             if left_s <= 0:
                 return None
+            if self._mode is not TriggerMode.SOFTWARE:
+                self._keep_clock(link)
 
     def execute(self, command: str) -> None:
         """Run a command of the camera's own, by its GenICam name.
@@ -159,6 +163,17 @@ class AravisCamera:
         self._check_open()
         link = self._present_link()
         link.call(lambda: link.features.execute(command))
+
+    def check_setup(self, rate_hz: float | None = None) -> list[Finding]:
+        """Whether this machine can receive `rate_hz` frames a second (None: as many as the camera gives).
+
+        Empty for cameras on USB. See `network.check_network`.
+        """
+        link = self._present_link()
+        fastest = 1e9 / self._capabilities.min_period_ns(self._present.exposure_ns)
+        if not link.is_gige:
+            return []
+        return check_network(link.address, self._payload, rate_hz or fastest, self._packet_size)
 
     def triggers_counted(self) -> int | None:
         """Triggers that the camera has counted since `start`, those included that gave no frame; None: it cannot."""
@@ -198,7 +213,7 @@ class AravisCamera:
     def _put(self, link: Link, settings: CameraSettings) -> CameraSettings:
         camera, features = link.camera, link.features
         if settings != CameraSettings():
-            camera_settings.put(camera, features, settings, self._limits)
+            camera_settings.put(camera, features, settings, self._name)
         return self._look(link).as_settings()
 
     def _look(self, link: Link) -> camera_settings.Present:
@@ -296,11 +311,22 @@ class AravisCamera:
         start = at if self._options.stamp_at == "start" else at - length
         source = caps.stamp
         if bound > caps.stamp_bound_ns or start + length - bound > received.arrival_ns:
+            self._doubt(bound, start + length - received.arrival_ns)
             source = Source.ESTIMATED
             bound = max(bound, start + length - received.arrival_ns)
         else:
             bound = max(bound, min(LEAST_BOUND_NS, caps.stamp_bound_ns))
         return Exposure(start, start + length, bound, source)
+
+    def _doubt(self, bound_ns: int, late_ns: int) -> None:
+        """Say once a run that stamps are not what was declared."""
+        if self._doubted or self._capabilities.stamp is Source.ESTIMATED:
+            return
+        self._doubted = True
+        why = f"is true to {bound_ns / 1e3:.0f} us only"
+        if late_ns > bound_ns:
+            why = f"says the exposure ended {late_ns / 1e3:.0f} us after its frame had come: try stamp_at"
+        _log.warning("%s: a stamp %s; such stamps are passed on as estimates", self._name, why)
 
     def _keep_clock(self, link: Link) -> None:
         """Compare the clocks now and then; between a software trigger and its frame nothing is in the way of it."""

@@ -117,7 +117,7 @@ def check(settings: CameraSettings, limits: Limits, name: str) -> None:
         _check_region(settings.region, limits, name)
 
 
-def put(camera: Any, features: Features, settings: CameraSettings, limits: Limits) -> None:
+def put(camera: Any, features: Features, settings: CameraSettings, name: str) -> None:
     """Set what is given; `check` has passed."""
     if settings.pixel_format is not None:
         camera.set_pixel_format_from_string(settings.pixel_format)
@@ -128,7 +128,7 @@ def put(camera: Any, features: Features, settings: CameraSettings, limits: Limit
         camera.set_region(*settings.region)
         taken = tuple(camera.get_region())
         if taken != tuple(settings.region):
-            raise DeviceError(f"region {list(settings.region)} reads back as {list(taken)}", hint="see its bounds")
+            raise DeviceError(f"region {list(settings.region)} reads back as {list(taken)}", device=name)
     if settings.gain_db is not None and camera.is_gain_available():
         camera.set_gain(settings.gain_db)
     if settings.exposure_ns is not None:

@@ -73,7 +73,7 @@ class Stream:
         if camera.is_gv_device():
             option = library.GvStreamOption
             device.set_stream_options(option.NONE if options.packet_socket else option.PACKET_SOCKET_DISABLED)
-        self._stream = camera.create_stream(None, None)
+        self._stream = _created(camera)
         if camera.is_gv_device():
             self._configure(options)
         self._parser = camera.create_chunk_parser() if counted else None
@@ -189,3 +189,11 @@ class Stream:
             if is_library_error(error):  # the chunk is not in this frame
                 return None
             raise
+
+
+def _created(camera: Any) -> Any:
+    """A stream without a callback: those crash when the interpreter ends. Aravis 0.10 takes one argument less."""
+    try:
+        return camera.create_stream(None, None)
+    except TypeError:
+        return camera.create_stream(None)

@@ -268,7 +268,8 @@ def use(camera: AravisCamera, state: str) -> None:
     [("unplug", "idle"), ("unplug", "armed"), ("unplug", "mid-sequence"), ("hang", "mid-sequence")],
 )
 def test_a_camera_that_goes_away_is_noticed_and_taken_up_again(fault: str, state: str) -> None:
-    with pair({"features": {"GevHeartbeatTimeout": 1300}}, exposure_ms=3.0) as it:
+    patience = {} if state == "mid-sequence" else {"loss_ms": 300.0}
+    with pair({"features": {"GevHeartbeatTimeout": 1300}, **patience}, exposure_ms=3.0) as it:
         camera = it.camera
         wanted = camera.apply(CameraSettings(gain_db=6.0, region=(0, 0, 160, 100)))
         if state != "idle":
@@ -298,6 +299,13 @@ def test_a_camera_that_goes_away_is_noticed_and_taken_up_again(fault: str, state
         camera.start(TriggerMode.FREE)
         assert it.frames(2)[1].pixels.shape == (100, 160)
         assert camera.details["losses"] == 1
+
+
+def test_the_machine_s_setup_is_looked_at_for_this_camera() -> None:
+    with pair() as it:
+        findings = {finding.subject: finding for finding in it.camera.check_setup(20_000.0)}
+        assert set(findings) == {"receive buffer", "packet size", "link speed"}
+        assert "20000 frames a second of 76800 bytes" in findings["link speed"].text
 
 
 def test_a_trigger_to_a_camera_that_hangs_fails_within_a_second() -> None:
