@@ -152,6 +152,7 @@ CALLS: tuple[tuple[str, dict[str, Any], Any], ...] = (
         {
             "number": 42,
             "id": JOB,
+            "kind": "scan",
             "method": "pmp",
             "state": "queued",
             "reason": None,
@@ -171,6 +172,7 @@ CALLS: tuple[tuple[str, dict[str, Any], Any], ...] = (
         {
             "number": 57,
             "id": JOB,
+            "kind": "scan",
             "method": "pmp",
             "state": "acquiring",
             "reason": None,
