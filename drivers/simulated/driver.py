@@ -10,6 +10,7 @@ from drivers.simulated.options import DEFAULT_SCENE, read_settings
 from drivers.simulated.projector import SimulatedProjector
 from drivers.simulated.rigs import rig, rig_names
 from drivers.simulated.scenes import scene_names
+from drivers.simulated.sequenced import SimulatedSequencedProjector
 from drivers.simulated.trigger_board import SimulatedTriggerBoard
 from drivers.simulated.world import enter_world
 from scanner.clock import Clock
@@ -54,7 +55,8 @@ class SimulatedProjectorDriver:
                 device=name,
                 hint="leave projector.mode out; another rig of `fringed devices` has another projector",
             )
-        return SimulatedProjector(enter_world(settings, clock, name), settings, name)
+        made = SimulatedSequencedProjector if settings.projector.kind == "sequencer" else SimulatedProjector
+        return made(enter_world(settings, clock, name), settings, name)
 
     def discover(self) -> Sequence[DeviceInfo]:
         """One projector for each reference rig."""

@@ -67,7 +67,7 @@ class CameraOptions:
 class ProjectorOptions:
     """The simulated projector's make."""
 
-    kind: str = field(default="framebuffer", metadata={"choices": ("framebuffer", "static")})
+    kind: str = field(default="framebuffer", metadata={"choices": ("framebuffer", "static", "sequencer")})
     scan: str = field(default="global", metadata={"choices": ("global", "rows")})
     """rows: a new image sweeps down over one refresh, as on an LCD"""
     modulation: str = field(default="declared", metadata={"choices": ("declared", "pwm", "none")})

@@ -70,7 +70,7 @@ class SimulatedProjector:
         period = self._capabilities.modulation_period_ns if options.modulation == "pwm" else None
         world.timeline.manner = Manner(
             sweep_ns=float(options.refresh_ns) if options.scan == "rows" else 0.0,
-            ramp_ns=options.settle_us * 1e3,
+            ramp_ns=0.0 if options.kind == "sequencer" else options.settle_us * 1e3,
             period_ns=period or 0,
             phase_ns=self._first_vblank_ns,
         )
@@ -187,6 +187,11 @@ class SimulatedProjector:
                 sweep + round(500 * options.settle_us), sweep + round(1500 * options.settle_us)
             )
         constant = rows or options.modulation == "none"
+        outputs = _OUTPUTS[options.trigger_outputs]
+        if options.kind == "sequencer":
+            # Micromirrors: light is there or not, and the controller tells with an edge when.
+            declared = {"latency": Interval(round(self._latency_ns), round(self._latency_ns)), "settle": Interval(0, 0)}
+            outputs, constant = outputs | {"exposure"}, True
         return ProjectorCapabilities(
             kind=ProjectorKind(options.kind),
             width=width,
@@ -194,6 +199,6 @@ class SimulatedProjector:
             refresh_ns=options.refresh_ns,
             modulation_period_ns=None if constant else round(options.refresh_ns / PERIODS_PER_REFRESH),
             scan="rows" if rows else "global",
-            trigger_outputs=_OUTPUTS[options.trigger_outputs],
+            trigger_outputs=outputs,
             **declared,
         )

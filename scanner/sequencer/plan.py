@@ -199,10 +199,15 @@ def plan(
         needed = _slot_time(mode, camera, exposure, delay, latency, starts_after)
     least = max(1, -(-needed // projector.refresh_ns))
     held = _dwell(mode, least, dwell, needed, projector, why)
-    period = camera_period if mode is Mode.STATIC else held * projector.refresh_ns
+    period = held * projector.refresh_ns
+    if mode is Mode.STATIC:
+        period = camera_period
+    elif projector.kind is ProjectorKind.SEQUENCER:
+        held, period = 1, needed
+        why["dwell"] = f"a slot's light and dark take {_ms(needed)}, whatever the refresh"
     line = None
     if mode is Mode.HARDWARE:
-        line = trigger_plan(projector, board, delay_ns=delay, exposure_ns=exposure, period_ns=period, why=why)
+        line = trigger_plan(projector, camera, board, delay_ns=delay, exposure_ns=exposure, period_ns=period, why=why)
     total = delay + period * len(sequence) * repeat
     why["total_ns"] = f"{len(sequence) * repeat} frames of {_ms(period)} each, without retakes"
     # A frame is missing only when it is surely not coming: exposure and transfer, a lost camera slot, and half a second
@@ -251,11 +256,14 @@ def _mode(
             f"the camera has no trigger mode {asked.value!r}",
             hint=f"it has: {', '.join(sorted(mode.value for mode in camera.trigger_modes)) or 'none'}",
         )
-    if projector.kind is ProjectorKind.SEQUENCER:
-        raise ConfigError(
-            "projectors that run a table of their own are not driven by this sequencer yet",
-            hint="use it as a plain display (framebuffer) if it has such a mode",
-        )
+    if projector.kind is ProjectorKind.SEQUENCER and len(sequence) > 1:
+        if TriggerMode.HARDWARE not in camera.trigger_modes or asked not in (None, TriggerMode.HARDWARE):
+            raise ConfigError(
+                "a projector that runs its own table fires the camera itself: it needs hardware trigger",
+                hint="wire the projector's trigger output to the camera's line, and leave trigger_mode out",
+            )
+        why["mode"] = "the projector runs its own table and fires the camera"
+        return Mode.HARDWARE
     if len(sequence) == 1:
         if TriggerMode.FREE in camera.trigger_modes and asked in (None, TriggerMode.FREE):
             why["mode"] = "one pattern: it stays on, and the camera runs by itself"

@@ -6,11 +6,18 @@ light comes later than the next flip, pulses run whole slots behind the flips. P
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from scanner.devices import CameraCapabilities, ProjectorCapabilities, TableSlot, TriggerCapabilities, TriggerSource
+from scanner.devices import (
+    CameraCapabilities,
+    ProjectorCapabilities,
+    ProjectorKind,
+    TableSlot,
+    TriggerCapabilities,
+    TriggerSource,
+)
 from scanner.errors import ConfigError
 
 GUARD_NS = 100_000
@@ -24,12 +31,14 @@ took a false one is found out by the count (one more frame than patterns)."""
 
 @dataclass(frozen=True)
 class TriggerPlan:
-    """How the camera's line is driven. Microseconds, as boards take them; 0 and 0 where the projector drives it."""
+    """How the camera's line is driven. Microseconds, as boards and controllers take them; 0 and 0 for `projector`."""
 
-    line: Literal["board", "projector"]
+    line: Literal["board", "projector", "table"]
+    """a trigger board; a display's own output, once a refresh; a projector that runs a table, once a slot"""
     dark_us: int = 0
-    """from the vertical blank that begins a slot to the pulse"""
+    """board: from the vertical blank that begins a slot to the pulse; table: dark time before a slot's light"""
     pulse_us: int = 0
+    """board: length of the pulse; table: of a slot's light"""
     lead: int = 0
     """slots by which pulses run behind flips: the first `lead` pulses see what shone before"""
 
@@ -45,6 +54,10 @@ class TriggerPlan:
             TypeError: it is something else.
         """
         return None if content is None else cls(**content)
+
+    def shown(self, images: Sequence[int]) -> list[TableSlot]:
+        """The table of a projector that runs one: these images in turn, each lit once, with an edge."""
+        return [TableSlot(image=i, exposure_us=self.pulse_us, dark_us=self.dark_us) for i in images]
 
     def table(self, patterns: int, dwell: int) -> list[TableSlot]:
         """The board's table for so many patterns, source VSYNC: every `dwell` vertical blanks one pulse."""
@@ -68,14 +81,27 @@ def trigger_time(
     Light changes over `spread_ns` (from the least latency to certain light); within the rest the exposure must lie,
     and the camera must be ready again. A projector's own pulse comes when light begins, so the next one counts.
     """
+    if projector.kind is ProjectorKind.SEQUENCER:
+        slot = table_slot(camera, exposure_ns)
+        return 1000 * (slot.dark_us + slot.pulse_us)
     rolling = camera.readout_ns if camera.shutter == "rolling" else 0
     late = camera.line_latency.high_ns if camera.line_latency is not None else 2 * camera.stamp_bound_ns
     wait = 2 * GUARD_NS + 1000 * board.dark_min_us if board is not None else projector.refresh_ns
     return max(spread_ns + wait + late + exposure_ns + rolling, camera.min_period_ns(exposure_ns) + GUARD_NS)
 
 
+def table_slot(camera: CameraCapabilities, exposure_ns: int) -> TriggerPlan:
+    """A slot of a projector's own table: light for as long as any row is exposed, dark until the camera is ready."""
+    rolling = camera.readout_ns if camera.shutter == "rolling" else 0
+    late = camera.line_latency.high_ns if camera.line_latency is not None else 2 * camera.stamp_bound_ns
+    lit = exposure_ns + rolling + late + GUARD_NS
+    dark = max(GUARD_NS, camera.min_period_ns(exposure_ns) + GUARD_NS - lit)
+    return TriggerPlan("table", -(-dark // 1000), -(-lit // 1000))
+
+
 def trigger_plan(
     projector: ProjectorCapabilities,
+    camera: CameraCapabilities,
     board: TriggerCapabilities | None,
     *,
     delay_ns: int,
@@ -94,6 +120,11 @@ def trigger_plan(
     Raises:
         ConfigError: there is nothing that could pulse the line.
     """
+    if projector.kind is ProjectorKind.SEQUENCER:
+        why["trigger"] = (
+            "the projector runs the table by itself, and each slot's light has an edge on the camera's line"
+        )
+        return table_slot(camera, exposure_ns)
     if board is None:
         if "frame" not in projector.trigger_outputs:
             raise ConfigError(

@@ -18,6 +18,7 @@ from scanner.devices import (
     Flip,
     Interval,
     Projector,
+    SequencedProjector,
     Source,
     TriggerBoard,
     TriggerEvent,
@@ -28,6 +29,9 @@ from scanner.sequencer.trigger_plan import GUARD_NS
 
 Take = Callable[[int, Flip, CameraFrame], None]
 """Called with a pattern, its flip and its frame."""
+
+Check = Callable[[], None]
+"""Called between slots; what it raises ends the round."""
 
 ARMED_EARLY = 0.1
 """Share of a refresh after a vertical blank at which the board should be armed: the flip has the rest of it."""
@@ -46,7 +50,7 @@ class TriggeredRounds:
         self.faults: list[str] = []
         """what the board reported, in words"""
 
-    def round(self, patterns: Sequence[int], black: int, take: Take, check: Callable[[], None]) -> dict[int, Flip]:
+    def round(self, patterns: Sequence[int], black: int, take: Take, check: Check) -> dict[int, Flip]:
         """Show patterns in turn and take a frame of each; the camera acquires in mode HARDWARE.
 
         Args:
@@ -61,7 +65,10 @@ class TriggeredRounds:
         Raises:
             DeviceError: a device failed.
         """
-        pairing = Pairing(self._plan, self._camera.capabilities.line_latency, with_board=self._board is not None)
+        line = self._camera.capabilities.line_latency
+        if isinstance(self._projector, SequencedProjector):
+            return self._run_table(self._projector, patterns, Pairing(self._plan, line, with_board=True), take, check)
+        pairing = Pairing(self._plan, line, with_board=self._board is not None)
         try:
             self._begin(len(patterns), black)
             hold = (self._plan.dwell - 1) * self._plan.refresh_ns + self._plan.refresh_ns // 2
@@ -75,6 +82,30 @@ class TriggeredRounds:
             self._collect(pairing, take, last + lead * self._plan.period_ns + self._plan.pop_timeout_ns, whole=True)
         finally:
             self._end(pairing)
+        return pairing.without_frame()
+
+    def _run_table(
+        self, projector: SequencedProjector, patterns: Sequence[int], pairing: Pairing, take: Take, check: Check
+    ) -> dict[int, Flip]:
+        """The projector's own table: its slots' starts are flips, and each one's edge fired the camera."""
+        if self._plan.trigger is None:
+            raise AssertionError("a plan in mode HARDWARE has its line")
+        projector.program(self._plan.trigger.shown([pattern % self._plan.patterns for pattern in patterns]))
+        projector.start()
+        latency = self._plan.latency or Interval(0, 0)
+        until = self._clock.now_ns() + self._plan.pop_timeout_ns + self._plan.period_ns
+        events: list[TriggerEvent] = []
+        while not (pairing.is_whole and len(events) == len(patterns)) and self._clock.now_ns() < until:
+            check()
+            frame = self._camera.pop(until - self._clock.now_ns())
+            for step, flip in list(enumerate(projector.flips()))[len(events) :]:
+                pairing.flipped(patterns[step], flip)
+                spread = latency.high_ns - latency.low_ns
+                lit_ns = flip.t_ns + latency.low_ns + spread // 2
+                events.append(TriggerEvent(0, step, lit_ns, flip.bound_ns + -(-spread // 2), flip.source))
+                until = flip.t_ns + self._plan.pop_timeout_ns + self._plan.period_ns
+            if frame is not None and (found := pairing.pair(frame, events)) is not None:
+                take(*found)
         return pairing.without_frame()
 
     def _begin(self, patterns: int, black: int) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from drivers.registry import open_camera, open_projector, open_trigger
+from drivers.simulated.sequenced import pack
 from drivers.simulated.trigger_board import CAPABILITIES as BOARD
 from scanner.clock import VirtualClock
 from scanner.devices import (
@@ -18,12 +20,14 @@ from scanner.devices import (
     Interval,
     ProjectorCapabilities,
     ProjectorKind,
+    SequencedProjector,
     Source,
+    TableSlot,
     TriggerEvent,
     TriggerMode,
     TriggerSource,
 )
-from scanner.errors import ConfigError, DeviceLost, SyncError
+from scanner.errors import ConfigError, DeviceError, DeviceLost, SyncError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence
 from scanner.sequencer import Plan, Rig, acquire
 from scanner.sequencer.plan import Mode, plan
@@ -269,3 +273,76 @@ def test_a_board_that_goes_away_is_a_lost_device() -> None:
     taken = take("trigger.unplug_after=4")
     assert isinstance(taken.acquisition.error, DeviceLost)
     assert taken.acquisition.reason.value == "device_lost"
+
+
+# --- a projector that runs its own table ----------------------------------------------------------------------------
+
+
+def test_three_patterns_share_a_video_frame_where_they_fit() -> None:
+    """2 ms exposures: 23 patterns in the time of 8 refreshes, each proved by the edge of its own light."""
+    taken = take("kind=sequencer&line=exposure", board=False, exposure_ns=2_000_000)
+    first, last = taken.acquisition.records[0], taken.acquisition.records[-1]
+    assert taken.acquisition.error is None
+    assert taken.acquisition.plan.trigger is not None
+    assert taken.acquisition.plan.trigger.line == "table"
+    assert first.flip is not None
+    assert last.exposure is not None
+    assert last.exposure.end_ns - first.flip.t_ns <= 8 * REFRESH
+    assert {verdict.verdict for verdict in taken.acquisition.verdicts} == {"proved"}
+    assert taken.error_px().max() < 4
+
+
+@pytest.mark.parametrize("exposure_ns", [12_500_001, 40_000_000])
+def test_long_slots_keep_their_video_frame(exposure_ns: int) -> None:
+    taken = take("kind=sequencer&line=exposure", board=False, exposure_ns=exposure_ns)
+    assert taken.acquisition.error is None
+    assert taken.acquisition.retakes == 0
+    assert taken.error_px().max() < 1
+
+
+@pytest.mark.parametrize(
+    "faults", ["skip=5&times=1", "drop=5&times=1", "swap=5", "counts_triggers=false&drop=6&times=1"]
+)
+def test_slots_without_a_frame_are_shown_again(faults: str) -> None:
+    taken = take(f"kind=sequencer&line=exposure&{faults}", board=False)
+    assert taken.acquisition.error is None
+    assert 0 < taken.acquisition.retakes < len(SEQUENCE)
+    assert taken.error_px().max() < 1
+
+
+def test_a_table_needs_the_cameras_line() -> None:
+    sequenced = replace(PROJECTOR, kind=ProjectorKind.SEQUENCER)
+    with pytest.raises(ConfigError, match="hardware trigger"):
+        plan(sequenced, replace(CAMERA, trigger_modes=frozenset({TriggerMode.SOFTWARE})), SEQUENCE)
+    with pytest.raises(ConfigError, match="hardware trigger"):
+        plan(sequenced, CAMERA, SEQUENCE, trigger_mode=TriggerMode.SOFTWARE)
+
+
+@pytest.mark.parametrize(
+    ("slot", "says"),
+    [
+        (TableSlot(image=9, exposure_us=1000, dark_us=0), "2 are loaded"),
+        (TableSlot(image=0, exposure_us=1, dark_us=0), "cannot be set"),
+        (TableSlot(image=0, exposure_us=1000, dark_us=-1), "cannot be set"),
+    ],
+)
+def test_a_table_that_cannot_be_run_is_refused(slot: TableSlot, says: str) -> None:
+    projector = open_projector("simulated", "quick/board?kind=sequencer", {}, VirtualClock())
+    assert isinstance(projector, SequencedProjector)
+    try:
+        with pytest.raises(DeviceError, match="nothing is programmed"):
+            projector.start()
+        projector.load([np.zeros((240, 320), np.uint8)] * 2)
+        with pytest.raises(ConfigError, match=says):
+            projector.program([slot])
+    finally:
+        projector.close()
+
+
+def test_patterns_are_packed_bit_exact() -> None:
+    random = np.random.default_rng(3)
+    images = [random.integers(0, 256, (6, 8), np.uint8) for _ in range(7)]
+    frames = pack(images)
+    assert [frame.shape for frame in frames] == [(6, 8, 3)] * 3
+    for i, image in enumerate(images):
+        np.testing.assert_array_equal(frames[i // 3][..., i % 3], image)
