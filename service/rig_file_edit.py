@@ -31,7 +31,7 @@ def set_values(path: Path, table: str, values: Mapping[str, Sequence[int]]) -> P
             hint=f"write into its {table}: {_words(values)}",
         )
     end = next((i for i in range(begin + 1, len(lines)) if lines[i].lstrip().startswith("[")), len(lines))
-    for key, value in reversed(values.items()):
+    for key, value in reversed(list(values.items())):
         new = f"{key} = [{', '.join(map(str, value))}]"
         place = next((i for i in range(begin + 1, end) if re.match(rf"\s*{key}\s*=", lines[i])), None)
         if place is not None:
