@@ -144,7 +144,7 @@ def spool(folder: Path, job: str) -> Path:
 
 
 def test_no_room_refuses_a_recording_and_an_unplugged_camera_ends_a_run(daemon: Callable[..., RunningDaemon]) -> None:
-    running = daemon(rig=f"{RIG}&unplug_after=30", spool_limit_gb=0.02)
+    running = daemon(rig=f"{RIG}&kind=static&unplug_after=30", spool_limit_gb=0.02)
     with Client(running.endpoint) as client:
         with pytest.raises(StorageError, match="spool"), client.live(retain="record", **SHORT) as frames:
             next(frames)

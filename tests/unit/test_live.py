@@ -27,11 +27,12 @@ from scanner.sequencer import Rig, endless
 from scanner.series import read_series, recording_at, segment_name
 from scanner.stream import LiveBegin, LiveCounts, LiveFrame
 from scanner.wire import LiveHeader, encode_live
-from service.live_files import close_recording, recorded_files
+from service.live_files import close_recording, recorded_files, reserve
 from service.live_series import LiveSeries, LiveTotals
 from service.live_storage import FrameRing, Recording, ring_slots
 from service.live_work import LiveWork
-from service.pipe import Shot
+from service.pipe import Kept, Shot
+from service.spool import Limits, Spool
 
 MCP = McpPattern(bits=2, carriers=(20.0, 34.0), codes=(0, 1, 2, 3))
 SEQUENCE = PatternSequence(ProjectorSize(160, 128), MCP)
@@ -147,6 +148,15 @@ def test_a_disk_that_fills_up_is_told_at_the_next_frames(tmp_path: Path, monkeyp
     recording.close("failed", "disk_full")
     (part,) = read_series(tmp_path / "run")
     assert len(Capture.open(part.path).records) == 256
+
+
+def test_a_recording_asks_for_room_for_what_follows(tmp_path: Path) -> None:
+    (tmp_path / "now").mkdir()
+    (tmp_path / "now" / "frames.npy").write_bytes(bytes(2_000_000))
+    spool = Spool(tmp_path, Limits(bytes=3_500_000))
+    assert reserve(spool, Kept("now", 256, 1_000_000), []) == []
+    with pytest.raises(StorageError, match="spool"):
+        reserve(spool, Kept("now", 256, 2_000_000), [])
 
 
 def _no_room(*_: object) -> None:
