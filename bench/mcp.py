@@ -1,13 +1,16 @@
-"""Speed of the MCP decoder: one frame of casey2011, uint8 image to dense rows, one thread.
+"""Speed of the MCP decoder: frames of casey2011, uint8 image to dense rows and to dense XYZ float32.
 
-    python bench/mcp.py [--scene bust] [--pattern own|published] [--runs 20]
+    python bench/mcp.py [--scene bust] [--pattern own|published] [--runs 20] [--seconds 20] [--threads 2]
 
-Prints the median CPU time of a decode and of each stage, ms, after two frames that warm caches.
+Prints the median CPU time of one thread, ms: of a frame decoded by itself, of one in a series (pitch and carriers are
+known from the frame before) with each stage, and of its XYZ; then the frames a second that so many threads sustain,
+each with a decoder of its own, from image to XYZ.
 """
 
 from __future__ import annotations
 
 import argparse
+import threading
 import time
 
 import cv2
@@ -15,7 +18,10 @@ import numba
 import numpy as np
 from mcp_accuracy import PATTERNS, take
 
+from scanner.decode import decoder_for
 from scanner.decode.mcp import decode_image, warm_up
+from scanner.decode.mcp.decoder import decode_next
+from scanner.triangulation import triangulate
 
 
 def main():
@@ -23,21 +29,55 @@ def main():
     parser.add_argument("--scene", default="bust")
     parser.add_argument("--pattern", default="own", choices=PATTERNS)
     parser.add_argument("--runs", type=int, default=20)
+    parser.add_argument("--seconds", type=float, default=0.0)
+    parser.add_argument("--threads", type=int, default=2)
     chosen = parser.parse_args()
     cv2.setNumThreads(1)
     numba.set_num_threads(1)
     warm_up()
-    frame, sequence, camera, *_ = take(f"casey2011/{chosen.scene}", PATTERNS[chosen.pattern])
-    total, stages = [], []
-    for run in range(chosen.runs + 2):
+    frame, sequence, camera, _, calibration = take(f"casey2011/{chosen.scene}", PATTERNS[chosen.pattern])
+    known = decode_next(frame, sequence.pattern, sequence.projector, camera, None)[1]
+    alone, series, points, stages = [], [], [], []
+    for _ in range(chosen.runs + 2):
         begin = time.thread_time()
-        decoded = decode_image(frame, sequence.pattern, sequence.projector, camera)
-        if run >= 2:
-            total.append(1e3 * (time.thread_time() - begin))
-            stages.append(decoded.details["stages_ms"])
-    for name in stages[0]:
-        print(f"  {name:16s} {np.median([s[name] for s in stages]):7.2f} ms")
-    print(f"{chosen.scene}, {chosen.pattern}: {np.median(total):.1f} ms a frame, {camera.width} x {camera.height}")
+        decode_image(frame, sequence.pattern, sequence.projector, camera)
+        alone.append(1e3 * (time.thread_time() - begin))
+        begin = time.thread_time()
+        decoded, known = decode_next(frame, sequence.pattern, sequence.projector, camera, known)
+        series.append(1e3 * (time.thread_time() - begin))
+        stages.append(decoded.details["stages_ms"])
+        begin = time.thread_time()
+        triangulate(calibration, rows=decoded.rows)
+        points.append(1e3 * (time.thread_time() - begin))
+    for name in stages[-1]:
+        print(f"  {name:16s} {np.median([s[name] for s in stages[2:]]):7.2f} ms")
+    one, next_one, xyz = (float(np.median(times[2:])) for times in (alone, series, points))
+    print(f"{chosen.scene}, {chosen.pattern}, {camera.width} x {camera.height}: by itself {one:.1f} ms a frame,")
+    print(f"  in a series {next_one:.1f} ms, XYZ {xyz:.1f} ms: image to XYZ {next_one + xyz:.1f} ms")
+    if chosen.seconds:
+        rate = sustained(frame, sequence, camera, calibration, chosen.threads, chosen.seconds)
+        print(f"  {chosen.threads} threads over {chosen.seconds:g} s: {rate:.1f} frames a second, image to XYZ")
+
+
+def sustained(frame, sequence, camera, calibration, threads, seconds):
+    """Frames a second, image to XYZ, of some threads that decode without a pause."""
+    end = time.perf_counter() + seconds
+    counts = [0] * threads
+
+    def work(number):
+        decoder = decoder_for(sequence, camera)
+        while time.perf_counter() < end:
+            decoder.add(0, frame)
+            triangulate(calibration, rows=decoder.finish().rows)
+            decoder.next_frame()
+            counts[number] += 1
+
+    crew = [threading.Thread(target=work, args=(number,)) for number in range(threads)]
+    for thread in crew:
+        thread.start()
+    for thread in crew:
+        thread.join()
+    return sum(counts) / seconds
 
 
 if __name__ == "__main__":

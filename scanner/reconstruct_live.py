@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.capture import CaptureHeader
-from scanner.decode import Decoded, Decoder, Reason, decoder_for
+from scanner.decode import Decoded, Decoder, Reason, SeriesDecoder, decoder_for
 from scanner.devices import Pixels
 from scanner.errors import CalibrationError, DecodeError
 from scanner.geometry import Calibration
@@ -49,6 +49,7 @@ class LiveReconstruction:
         *,
         xyz: bool = False,
         stride: int = 1,
+        follow: bool = True,
     ) -> None:
         """Make ready.
 
@@ -58,6 +59,8 @@ class LiveReconstruction:
             options: as for a scan.
             xyz: points instead of rows.
             stride: of points.
+            follow: whether what one frame taught the decoder (where the pattern is) may help it with the next. False
+                decodes each frame as if it were the first: its values then depend on nothing else.
 
         Raises:
             CalibrationError: another rig's calibration, or none for xyz.
@@ -72,6 +75,7 @@ class LiveReconstruction:
         self._options = options
         self._xyz = xyz
         self._stride = stride
+        self._follow = follow
         self._projector = header.sequence.projector
         pattern = header.sequence.pattern
         if len(header.sequence) != 1 or not isinstance(pattern, McpPattern):
@@ -102,7 +106,10 @@ class LiveReconstruction:
             DecodeError: it shows no pattern, or another one.
         """
         if self._used:
-            self._decoder = self._new_decoder()
+            if self._follow and isinstance(self._decoder, SeriesDecoder):
+                self._decoder.next_frame()
+            else:
+                self._decoder = self._new_decoder()
         self._used = True
         self._decoder.add(0, frame)
         return self._decoder.finish()

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +78,18 @@ class Decoder(Protocol):
         Raises:
             DecodeError: too few frames, or frames that contradict the description.
         """
+
+
+@runtime_checkable
+class SeriesDecoder(Decoder, Protocol):
+    """A decoder that may be used again: what one frame teaches (where the pattern is, how large) helps with the next.
+
+    add, finish, next_frame, add, finish, ... Its maps are those of a new decoder but for what a search would have found
+    anew; it searches again by itself when what it knows does not fit.
+    """
+
+    def next_frame(self) -> None:
+        """Make ready for another frame list; frames taken so far are forgotten."""
 
 
 DECODERS: Mapping[str, tuple[str, ...]] = {"mcp": ("default", "casey2011")}

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scanner.decode import Decoded, Reason, decoder_for
+from scanner.decode import Decoded, Reason, SeriesDecoder, decoder_for
 from scanner.decode.mcp import McpDecoder, decode_image
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, PmpPattern, ProjectorSize
@@ -196,3 +196,55 @@ def test_another_code_order_than_described_is_refused():
 def test_a_tiny_image_is_refused():
     with pytest.raises(DecodeError, match="smaller"):
         decode_image(np.zeros((16, 16), np.uint8), OWN, PROJECTOR, CameraFormat(16, 16))
+
+
+def nearer_rows(y, x):
+    """The smooth surface a third nearer: stripes and carriers are larger."""
+    return 40 + 0.45 * y + 6 * np.exp(-(((x - 250) / 90) ** 2) - ((y - 190) / 70) ** 2), 40 + 0.52 * x
+
+
+def add_and_finish(decoder, frame):
+    decoder.add(0, frame)
+    return decoder.finish()
+
+
+def searched(decoded):
+    return "carriers" in decoded.details["stages_ms"]
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["upright", "upside down"])
+def test_a_series_searches_once_and_gives_what_single_frames_give(turned):
+    frame, _ = render(OWN)
+    frame = np.ascontiguousarray(frame[::-1]) if turned else frame
+    decoder = decoder_for(PatternSequence(PROJECTOR, OWN), CAMERA)
+    assert isinstance(decoder, SeriesDecoder)
+    first = add_and_finish(decoder, frame)
+    decoder.next_frame()
+    with pytest.raises(DecodeError, match="missing"):
+        decoder.finish()
+    second = add_and_finish(decoder, frame)
+    decoder.next_frame()
+    third = add_and_finish(decoder, frame)
+    assert searched(first)
+    assert not searched(third)
+    np.testing.assert_array_equal(third.rows, first.rows)
+    np.testing.assert_array_equal(third.peaks, second.peaks)
+
+
+def test_a_change_of_scene_or_a_dark_frame_is_searched_anew():
+    frame, _ = render(OWN)
+    other, _ = render(OWN, nearer_rows)
+    alone = decode_image(other, OWN, PROJECTOR, CAMERA)
+    decoder = decoder_for(PatternSequence(PROJECTOR, OWN), CAMERA)
+    add_and_finish(decoder, frame)
+    decoder.next_frame()
+    changed = add_and_finish(decoder, other)
+    assert searched(changed)
+    np.testing.assert_array_equal(changed.rows, alone.rows)
+    decoder.next_frame()
+    with pytest.raises(DecodeError, match="black"):
+        add_and_finish(decoder, np.zeros(CAMERA.shape, np.uint8))
+    decoder.next_frame()
+    again = add_and_finish(decoder, other)
+    assert searched(again)
+    np.testing.assert_array_equal(again.rows, alone.rows)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scanner.decode import Decoded, Reason
 from scanner.decode.frames import FrameCheck
 from scanner.decode.mcp import dense, emissions, hmm, linking, magnification, stripes, subpixel
-from scanner.decode.mcp.locate import Array, Found, Image, Stages, locate
+from scanner.decode.mcp.locate import Array, Found, Image, Known, Stages, locate
 from scanner.decode.mcp.model import PatternModel
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
@@ -62,37 +62,100 @@ def decode_image(
     Raises:
         DecodeError: no pattern, another pattern, one turned by 90 degrees, or stripes too fine for the camera.
     """
+    return decode_next(image, pattern, projector, camera, None)[0]
+
+
+def decode_next(
+    image: NDArray[np.uint8] | NDArray[np.uint16],
+    pattern: McpPattern,
+    projector: ProjectorSize,
+    camera: CameraFormat,
+    known: Known | None,
+) -> tuple[Decoded, Known]:
+    """Decode one image of a series.
+
+    Args:
+        image, pattern, projector, camera: as for `decode_image`.
+        known: what the frame before taught; None, or where it does not hold any more: everything is searched anew.
+
+    Returns:
+        the maps, and what the next frame may use.
+
+    Raises:
+        DecodeError: as `decode_image`.
+    """
     pattern.validate(projector)
     upright = upright_image(image, pattern, camera)
     model = PatternModel.of(pattern, projector)
+    result = None if known is None else _by_what_is_known(upright, model, camera, known)
+    decoded, learnt = result or _decode_anew(upright, model, camera)
+    return decoded if pattern.axis == "y" else turned_back(decoded), learnt
+
+
+def _by_what_is_known(
+    upright: Image, model: PatternModel, camera: CameraFormat, known: Known
+) -> tuple[Decoded, Known] | None:
+    """None where it does not hold any more."""
+    clock = Stages()
+    seen = np.ascontiguousarray(upright[::-1]) if known.upside_down else upright
+    found = locate(seen, model, camera, clock, known)
+    if found.fault is not None:
+        return None
+    decided = _decide(found, model, clock)
+    if not decided.agreement.holds or not known.still_holds(_learnt(found, decided, upside_down=known.upside_down)):
+        return None
+    decoded = _maps(seen, found, decided, model, clock)
+    return _upside_down(decoded) if known.upside_down else decoded, known
+
+
+def _decode_anew(upright: Image, model: PatternModel, camera: CameraFormat) -> tuple[Decoded, Known]:
     clock = Stages()
     found = locate(upright, model, camera, clock)
     if found.fault is not None:
         _explain(found, upright, model, camera)
     decided = _decide(found, model, clock)
-    decoded = None
     if decided.agreement.holds:
-        decoded = _maps(upright, found, decided, model, clock)
-    else:
-        # The projector may hang upside down: then the stripes' order is reversed.
-        turned = np.ascontiguousarray(upright[::-1])
-        found = locate(turned, model, camera, clock)
-        again = _decide(found, model, clock) if found.fault is None else decided
-        if again.agreement.holds:
-            decoded = _upside_down(_maps(turned, found, again, model, clock))
-    if decoded is None:
-        _refuse_turned(upright, model, camera)
-        a = decided.agreement
-        raise DecodeError(
-            "stripes and carriers are there, but the codes contradict the description "
-            f"(of {a.clear:.0%} clear code words {a.agree:.0%} fit, {a.order:.0%} of neighbours are in order)",
-            hint="check bits, carriers, codes and axis of the description against what is projected",
-        )
-    return decoded if pattern.axis == "y" else turned_back(decoded)
+        return _maps(upright, found, decided, model, clock), _learnt(found, decided, upside_down=False)
+    # The projector may hang upside down: then the stripes' order is reversed.
+    turned = np.ascontiguousarray(upright[::-1])
+    found = locate(turned, model, camera, clock)
+    again = _decide(found, model, clock) if found.fault is None else decided
+    if again.agreement.holds:
+        return _upside_down(_maps(turned, found, again, model, clock)), _learnt(found, again, upside_down=True)
+    _refuse_turned(upright, model, camera)
+    a = decided.agreement
+    raise DecodeError(
+        "stripes and carriers are there, but the codes contradict the description "
+        f"(of {a.clear:.0%} clear code words {a.agree:.0%} fit, {a.order:.0%} of neighbours are in order)",
+        hint="check bits, carriers, codes and axis of the description against what is projected",
+    )
+
+
+def _learnt(found: Found, decided: _Decision, *, upside_down: bool) -> Known:
+    peaks, search = found.peaks, found.search
+    assert peaks is not None  # noqa: S101  (as in `_decide`)
+    assert search is not None  # noqa: S101
+    label = decided.label
+    follow = (label[:-1] >= 0) & (label[1:] == label[:-1] + 1)
+    spacing = np.diff(peaks.y)[follow]
+    spacing = spacing[spacing > 0]  # not from the foot of one column to the head of the next
+    return Known(
+        found.pitch,
+        found.match,
+        search,
+        upside_down,
+        float(np.median(spacing)) if spacing.size else found.pitch,
+        decided.magnification,
+        decided.agreement.hits,
+        float((label >= 0).mean()) if label.size else 0.0,
+    )
 
 
 class McpDecoder:
     """Takes the one frame of an MCP sequence (and its white and black ones, if any) and decodes it.
+
+    In a series, `next_frame` after each `finish` keeps what the frame taught: pitch and carriers are searched again
+    only when they do not hold any more, after a change of scene or of distance.
 
     Raises:
         DecodeError: the sequence is not MCP.
@@ -104,7 +167,12 @@ class McpDecoder:
         self._sequence = sequence
         self._pattern = sequence.pattern
         self._camera = camera
-        self._check = FrameCheck(sequence, camera)
+        self._known: Known | None = None
+        self.next_frame()
+
+    def next_frame(self) -> None:
+        """Forget the frames taken, keep what they taught; see `scanner.decode.SeriesDecoder`."""
+        self._check = FrameCheck(self._sequence, self._camera)
         self._image: NDArray[Any] | None = None
         self._black: NDArray[Any] | None = None
 
@@ -118,7 +186,9 @@ class McpDecoder:
 
     def finish(self) -> Decoded:
         """The maps; see `scanner.decode.Decoder`."""
-        return decode_image(self.frame(), self._pattern, self._sequence.projector, self._camera)
+        known, self._known = self._known, None  # a frame that is refused teaches nothing
+        decoded, self._known = decode_next(self.frame(), self._pattern, self._sequence.projector, self._camera, known)
+        return decoded
 
     def frame(self) -> NDArray[Any]:
         """The one frame, the black one taken off where there is one.
@@ -202,6 +272,7 @@ class _Decision:
     light: Array
     fine: subpixel.Fine
     agreement: emissions.Agreement
+    magnification: float
     figures: dict[str, Any]
 
 
@@ -263,7 +334,7 @@ def _decide(found: Found, model: PatternModel, clock: Stages) -> _Decision:
         "peaks_decided": int((label >= 0).sum()),
         "thresholds": {"decided": DECIDED, "min_chain_px": MIN_CHAIN_PX, "height_share": stripes.HEIGHT_FLOOR},
     }
-    return _Decision(label, confidence, np.maximum(seen.light, 0), fine, agrees, figures)
+    return _Decision(label, confidence, np.maximum(seen.light, 0), fine, agrees, float(np.median(scale_field)), figures)
 
 
 # --- maps ---------------------------------------------------------------------------------------------------------
@@ -356,8 +427,6 @@ def _reasons(found: Found, decided: _Decision, rows: Array) -> NDArray[np.uint8]
     half_lit = np.median(peaks.valley) + 0.5 * np.median(peaks.height)
     small = np.where(half_lit < found.reduced, np.uint8(Reason.LOW_MODULATION), np.uint8(Reason.SHADOW))
     dense.spread(chains.column, peaks.y, why, int(0.6 * found.pitch), small)
-    reason = np.repeat(small.T, stripes.STEP, axis=1)
-    if reason.shape[1] < rows.shape[1]:
-        reason = np.pad(reason, ((0, 0), (0, rows.shape[1] - reason.shape[1])), mode="edge")
-    reason[np.isfinite(rows)] = Reason.VALUE
+    reason = np.empty(rows.shape, np.uint8)
+    dense.widen_reasons(small, rows, reason)
     return reason

@@ -291,3 +291,27 @@ def _spread(column: Ints, y: Array, value: NDArray[np.uint8], reach: int, around
             high = min(high, np.float32(0.5) * (y[k] + y[k + 1]))
         for q in range(max(int(np.ceil(low)), 0), min(int(np.floor(high)), size - 1) + 1):
             around[column[k], q] = value[k]
+
+
+def widen_reasons(around: NDArray[np.uint8], rows: Array, reason: NDArray[np.uint8]) -> None:
+    """Reasons of columns of four pixels to all pixels; 0 (`Reason.VALUE`) where there is a row.
+
+    Args:
+        around: (B, H) uint8.
+        rows: (H, W) float32, NaN where there is none.
+        reason: (H, W) uint8, set in place. The last column takes what is left over at the right.
+    """
+    _widen_reasons(around, rows, reason)
+
+
+@kernel
+def _widen_reasons(around: NDArray[np.uint8], rows: Array, reason: NDArray[np.uint8]) -> None:
+    columns = around.shape[0]
+    height, width = rows.shape
+    block = 16
+    for y0 in range(0, height, block):
+        for b in range(columns):
+            last = width if b == columns - 1 else 4 * b + 4
+            for y in range(y0, min(y0 + block, height)):
+                for x in range(4 * b, last):
+                    reason[y, x] = around[b, y] if np.isnan(rows[y, x]) else np.uint8(0)

@@ -31,6 +31,9 @@ PLAIN_CONTRAST = 1.8
 PITCHES_TRIED = 3
 """Candidates for the pitch: the stripes', and two that texture may offer."""
 
+NEAR = 0.06
+"""Change of the stripes' distance, relative, up to which pitch and carriers of a frame before serve."""
+
 MIN_PITCH_MATCH = 0.35
 """Least correlation of the image's and the pattern's spectrum along the phase direction."""
 
@@ -66,7 +69,34 @@ class Found:
     search: carriers.CarrierSearch | None = None
 
 
-def locate(image: Image, model: PatternModel, camera: CameraFormat, clock: Stages) -> Found:
+@dataclass(frozen=True)
+class Known:
+    """What one frame teaches of the next: pitch and carriers, and how well the frame agreed with them.
+
+    upside_down: the image is turned before. spacing: decoded stripes' median distance, px. magnification: median of the
+    field about the search's own. hits: as in `emissions.Agreement`. decided: share of the peaks with a stripe.
+    """
+
+    pitch: float
+    match: float
+    search: carriers.CarrierSearch
+    upside_down: bool
+    spacing: float
+    magnification: float
+    hits: float
+    decided: float
+
+    def still_holds(self, now: Known) -> bool:
+        """Whether a frame decoded by this knowledge shows what it was learnt from.
+
+        A surface nearer or further by an eighth changes spacing and magnification by that; pitch windows and the field
+        (`magnification.FIELD_RANGE`) take half of it. Fewer carriers or stripes than there were ask for a new search.
+        """
+        near = abs(now.spacing / self.spacing - 1) < NEAR and abs(now.magnification - self.magnification) < NEAR / 2
+        return near and now.hits >= 0.9 * self.hits and now.decided >= 0.7 * self.decided
+
+
+def locate(image: Image, model: PatternModel, camera: CameraFormat, clock: Stages, known: Known | None = None) -> Found:
     """Find stripes and carriers.
 
     Args:
@@ -74,6 +104,7 @@ def locate(image: Image, model: PatternModel, camera: CameraFormat, clock: Stage
         model: the pattern's tables.
         camera: the frame's format.
         clock: takes the stages' times.
+        known: of a frame before: no pitch and no carriers are searched then.
 
     Returns:
         what was found; its `fault` says why there is no pattern, if there is none.
@@ -88,6 +119,10 @@ def locate(image: Image, model: PatternModel, camera: CameraFormat, clock: Stage
         found.fault = f"no pattern: the image is {state} (grey levels {low:.0f} to {high:.0f})"
         found.hint = "check that the projector shows the pattern, its focus, and the exposure"
         return found
+    if known is not None:
+        return _search(
+            replace(found, pitch=known.pitch, match=known.match, search=known.search), image, model, camera, clock
+        )
     with clock.stage("pitch"):
         candidates = stripes.estimate_pitch(found.reduced, model, PITCHES_TRIED)
     best: Found | None = None
@@ -118,6 +153,8 @@ def _search(found: Found, image: Image, model: PatternModel, camera: CameraForma
         found.signals = carriers.signals_along(image, found.peaks, found.chains, found.pitch, camera.max_value)
     if len(found.peaks) == 0:
         found.fault = "no stripes stand out of the noise"
+        return found
+    if found.search is not None:
         return found
     with clock.stage("carriers"):
         found.search = carriers.search_carriers(
