@@ -17,6 +17,7 @@ from typing import Any
 
 from drivers.aravis import settings as camera_settings
 from drivers.aravis import triggers
+from drivers.aravis.frame_ids import FrameIds
 from drivers.aravis.link import Link
 from drivers.aravis.network import Finding, check_network
 from drivers.aravis.options import Options
@@ -40,9 +41,6 @@ STALE_NS = 750_000_000
 POP_LOOK_S = 0.05
 CLOSED_S = 10.0
 
-ID_WRAP = 0xFFFF
-"""GigE Vision 1.x counts frames 1 .. 65535 and begins again"""
-
 _log = logging.getLogger(__name__)
 
 
@@ -59,7 +57,7 @@ class AravisCamera:
         self._mode: TriggerMode | None = None
         self._open = True
         self._lent: Received | None = None
-        self._ids = _Unwrapped()
+        self._ids = FrameIds()
         self._next_clock_ns = 0
         self._losses = 0
         self._counted = False
@@ -69,6 +67,8 @@ class AravisCamera:
         self._closing = threading.Event()
         self._lock = threading.Lock()
         self._link = self._new_link(device)
+        self._running = self._link
+        """the one that the present run, or the last one, began on: a run does not survive a loss"""
 
     @property
     def name(self) -> str:
@@ -119,7 +119,7 @@ class AravisCamera:
             raise ConfigError(f"no trigger mode {mode.value!r} on this camera", device=self._name, hint=f"it has {has}")
         link = self._present_link()
         link.call(lambda: self._begin(link, mode))
-        self._ids, self._doubted = _Unwrapped(), False
+        self._ids, self._doubted, self._running = FrameIds(), False, link
         self._mode = mode
 
     def trigger(self) -> None:
@@ -127,7 +127,7 @@ class AravisCamera:
         self._check_open()
         if self._mode is not TriggerMode.SOFTWARE:
             raise DeviceError("a trigger needs the camera started in mode software", device=self._name)
-        link = self._link
+        link = self._running
         link.call(lambda: link.features.execute("TriggerSoftware"))
 
     def pop(self, timeout_ns: int) -> CameraFrame | None:
@@ -135,8 +135,7 @@ class AravisCamera:
         self._check_open()
         if self._mode is None:
             raise DeviceError("the camera is not acquiring", device=self._name, hint="start it first")
-        link = self._link
-        stream = link.stream
+        link, stream = self._running, self._running.stream
         if link.lost.is_set() or stream is None:
             raise link.loss()
         self._give_back(stream)
@@ -187,7 +186,7 @@ class AravisCamera:
             return
         self._mode = None
         self._lent = None
-        link = self._link
+        link = self._running
         if link.lost.is_set():
             return
         try:
@@ -263,7 +262,11 @@ class AravisCamera:
         link.read_clock()
         self._payload = int(link.camera.get_payload())
         link.stream = Stream(link.camera, self._options, counted=counted, heard=link.heard)
-        features.execute("AcquisitionStart")
+        try:
+            features.execute("AcquisitionStart")
+        except BaseException:
+            self._drop_stream(link)
+            raise
 
     def _set_rate(self, link: Link) -> None:
         """As asked, or no faster than declared: some cameras begin the next exposure during readout."""
@@ -286,6 +289,9 @@ class AravisCamera:
 
     def _finish(self, link: Link) -> None:
         link.features.execute("AcquisitionStop")
+        self._drop_stream(link)
+
+    def _drop_stream(self, link: Link) -> None:
         stream, link.stream = link.stream, None
         if stream is not None:
             self._ended_counts = stream.counts()
@@ -395,23 +401,6 @@ class AravisCamera:
     def _check_open(self) -> None:
         if not self._open:
             raise DeviceError("the camera is closed", device=self._name)
-
-
-class _Unwrapped:
-    """The camera's count of frames without its wrap, so that no two frames of a run have the same."""
-
-    def __init__(self) -> None:
-        self._last: int | None = None
-        self._wraps = 0
-
-    def next(self, frame_id: int) -> int:
-        """The count that goes on. A step back of less than half the range is a late frame, not a wrap."""
-        if frame_id > ID_WRAP:  # extended ids have 64 bits
-            return frame_id
-        if self._last is not None and self._last - frame_id > ID_WRAP // 2:
-            self._wraps += 1
-        self._last = frame_id
-        return frame_id + self._wraps * ID_WRAP
 
 
 def _merged(before: CameraSettings, settings: CameraSettings) -> CameraSettings:

@@ -3,11 +3,13 @@
 Two kinds of pairs. *Latched*: the camera was told to read its clock between two readings of ours; the true time lies
 between them (Cristian 1989). *Arrival*: a stamped frame came; its stamp is not later than that, by an unknown delay
 of which only the least is of use (lower envelope; Moon, Skelley, Towsley 1999). Crystals are within 100 ppm of their
-nominal rate, which holds a fit that has seen little. Pure: no clock is read here.
+nominal rate, which holds a fit that has seen little. Pure: no clock is read here. One thread may feed a fit while
+another one asks it.
 """
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from dataclasses import dataclass
 
@@ -58,6 +60,7 @@ class ClockFit:
         self._line: Line | None = None
         self._bin_start = 0
         self._bounds: list[tuple[int, float]] = []
+        self._lock = threading.Lock()
 
     def __len__(self) -> int:
         return len(self._readings)
@@ -65,13 +68,17 @@ class ClockFit:
     def add(self, device_ns: int, low_ns: int, high_ns: int) -> None:
         """A pair. Latched: our time lay between low and high. Arrival: high is when the frame came, low the same."""
         reading = Reading(device_ns, (low_ns + high_ns) // 2, (high_ns - low_ns + 1) // 2)
+        with self._lock:
+            self._take(reading)
+
+    def _take(self, reading: Reading) -> None:
         last = self._readings[-1] if self._readings else None
-        if last is not None and device_ns - self._bin_start < BIN_NS:
+        if last is not None and reading.device_ns - self._bin_start < BIN_NS:
             if self._better(reading, last):
                 self._readings[-1] = reading
                 self._line = None
             return
-        self._bin_start = device_ns
+        self._bin_start = reading.device_ns
         self._readings.append(reading)
         self._line = None
 
@@ -81,8 +88,9 @@ class ClockFit:
         Raises:
             ValueError: nothing was fed yet.
         """
-        line = self._fitted()
-        return round(line.host_ns(device_ns)), round(self._bound(device_ns)) + self._slack_ns
+        with self._lock:
+            line = self._fitted()
+            return round(line.host_ns(device_ns)), round(self._bound(device_ns)) + self._slack_ns
 
     @property
     def newest_ns(self) -> int:
@@ -92,13 +100,15 @@ class ClockFit:
     @property
     def rate(self) -> float:
         """Our nanoseconds to one of the camera's."""
-        return self._fitted().rate
+        with self._lock:
+            return self._fitted().rate
 
     @property
     def residual_ns(self) -> float:
         """How far the worst reading lies from the line beyond its own width; 0: the line explains all of them."""
-        line = self._fitted()
-        return max(max(0.0, abs(self._off(line, r)) - r.half_ns) for r in self._readings)
+        with self._lock:
+            line = self._fitted()
+            return max(max(0.0, abs(self._off(line, r)) - r.half_ns) for r in self._readings)
 
     def _better(self, reading: Reading, last: Reading) -> bool:
         if self.latched:

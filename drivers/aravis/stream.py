@@ -125,14 +125,13 @@ class Stream:
         self.end()
         self._thread.join(timeout=50 * POP_US / 1e6)
         self._frames.clear()
-        del self._stream
+        self._stream = None
         self._arrays.clear()
 
     def counts(self) -> Mapping[str, int]:
         """The library's own counters: n_completed_buffers, n_failures, n_underruns, n_resent_packets and others."""
-        stream = self._stream
-        found = {}
-        for i in range(stream.get_n_infos()):
+        stream, found = self._stream, {}
+        for i in range(0 if stream is None else stream.get_n_infos()):
             name = str(stream.get_info_name(i))
             if str(stream.get_info_type(i).name) == "guint64":
                 found[name] = int(stream.get_info_uint64(i))

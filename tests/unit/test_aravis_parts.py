@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.aravis import camera_driver, library
-from drivers.aravis.camera import _Unwrapped
 from drivers.aravis.clock_fit import CRYSTAL, ClockFit
+from drivers.aravis.frame_ids import FrameIds
 from drivers.aravis.network import buffer_bytes, check_buffer, check_network, interface_to
 from drivers.aravis.options import Options, read_options
 from drivers.aravis.pixels import FORMATS, unpacked
@@ -128,10 +128,10 @@ def test_a_clock_never_compared_says_so() -> None:
 
 
 def test_frame_ids_go_on_where_the_camera_begins_again() -> None:
-    ids = _Unwrapped()
+    ids = FrameIds()
     told = [65_533, 65_534, 65_535, 1, 2, 5]
     assert [ids.next(each) for each in told] == [65_533, 65_534, 65_535, 65_536, 65_537, 65_540]
-    extended = _Unwrapped()
+    extended = FrameIds()
     assert [extended.next(each) for each in (70_000, 70_001)] == [70_000, 70_001]
 
 
