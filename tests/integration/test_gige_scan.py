@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -172,6 +173,15 @@ def test_cameras_of_another_process_are_found_by_an_ordinary_user(tmp_path: Path
             )
             assert seen.returncode == 0, seen.stderr
             assert seen.stdout.strip() == "127.0.0.43"
+            if tool := shutil.which("arv-tool-0.8"):  # package aravis-tools-cli, for those who have it
+                told_it = subprocess.run(
+                    [tool, "-a", "127.0.0.42", "control", "Gain=3", "Width"],
+                    capture_output=True,
+                    text=True,
+                    check=True,
+                    timeout=30,
+                )
+                assert told_it.stdout.splitlines() == ["Gain = 3 dB min:0 max:24", "Width = 320 min:16 max:320 inc:4"]
         finally:
             it.send_signal(signal.SIGINT)
             assert it.wait(10) == 130
