@@ -93,7 +93,7 @@ def _decoder(capture: Capture, calibration: Path | None, settings: Mapping[str, 
     lenses = calibration_for(capture, calibration)
     if lenses is None:
         print_error("no calibration: values are decoded, but no points", "--calibration FILE", label="warning")
-    return LiveReconstruction(capture.header, lenses, DecodeOptions.from_dict(settings))
+    return LiveReconstruction(capture.header, lenses, DecodeOptions.from_dict(settings), follow=False)
 
 
 def _decode(decoder: LiveReconstruction, frame: _Frame, folder: Path) -> int:
