@@ -291,6 +291,9 @@ def _warm_up() -> None:
     began = time.perf_counter()
     for name in modules_with_kernels():
         if name.startswith("scanner."):
-            importlib.import_module(name).warm_up()
+            try:
+                importlib.import_module(name).warm_up()
+            except Exception:  # noqa: BLE001  (one decoder that is broken fails its own scans, and not all others)
+                _log.exception("%s could not be made ready", name)
     importlib.import_module("scanner.reconstruct")
     _log.info("decoder ready after %.2f s", time.perf_counter() - began)
