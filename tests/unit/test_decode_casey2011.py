@@ -19,6 +19,7 @@ from scanner.decode.mcp.casey2011 import (
     growth,
     hidden_markov,
     inclination,
+    refusals,
     stripe_detection,
 )
 from scanner.decode.mcp.casey2011.stripe_detection import Peaks
@@ -444,6 +445,29 @@ def test_what_is_not_the_pattern_described_is_refused(board):
     for message, (image, pattern) in cases.items():
         with pytest.raises(DecodeError, match=message):
             decode_image(image, pattern, sequence.projector, camera)
+
+
+def test_the_described_order_has_to_fit_better_than_shuffled_ones():
+    symbols = np.arange(1, 16, dtype=np.int32)
+    rates = np.full(4, 0.159), np.full(4, 0.2)
+    rng = np.random.default_rng(0)
+    columns = 160
+    peaks = Peaks(
+        np.arange(0, 15 * columns + 1, 15, dtype=np.int32),
+        np.tile(np.arange(15, dtype=np.int32), columns),
+        np.repeat(np.arange(columns, dtype=np.int32), 15),
+    )
+    for clear in (0.95, 0.6):
+        word = np.where(rng.random(15 * columns) < clear, np.tile(symbols, columns), rng.integers(0, 16, 15 * columns))
+        known = hidden_markov.model(symbols, *rates)
+        word = word.astype(np.int32)
+        agreement = hidden_markov.fitting(word, hidden_markov.best_paths(word, peaks.start, known), symbols)
+        assert agreement > clear - 0.1
+        assert refusals.refuse_order(agreement, word, peaks, symbols, rates) < agreement - refusals.MARGIN
+        order = rng.permutation(symbols)
+        path = hidden_markov.best_paths(word, peaks.start, hidden_markov.model(order, *rates))
+        with pytest.raises(DecodeError, match="contradict the description"):
+            refusals.refuse_order(hidden_markov.fitting(word, path, order), word, peaks, order, rates)
 
 
 def test_the_name_goes_with_mcp_alone():

@@ -1,5 +1,6 @@
 """The published MCP decoder as a reference: C. J. Casey, University of Kentucky 2011, chapters 4 and 5.
 
+    refusals           what is no pattern, or another one
     stripe_detection   adaptive threshold in two passes, peaks to the pixel      4.1
     inclination        slope of the stripes, segments, rotation                  4.2
     carrier_search     analysis by synthesis                                     4.3

@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Reason
-from scanner.decode.mcp.casey2011 import carrier_search, channels, growth, hidden_markov, inclination, stripe_detection
+from scanner.decode.mcp.casey2011 import (
+    carrier_search,
+    channels,
+    growth,
+    hidden_markov,
+    inclination,
+    refusals,
+    stripe_detection,
+)
 from scanner.decode.mcp.casey2011.shown import Shown
 from scanner.decode.mcp.decoder import McpDecoder, turned_back, upright_image
 from scanner.decode.mcp.locate import Stages
@@ -22,27 +30,8 @@ from scanner.decode.stages import Observer
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
 
-LEAST_CONTRAST = 0.01
-"""Share of the camera's range below which an image holds no pattern."""
-
-FINEST_PX = 6.0
-"""Stripes nearer than this have no region and peak of their own."""
-
-LEAST_LIT = 0.005
-"""Share of all columns' stripes that must have a peak; fewer is no pattern."""
-
-MATCH = 0.15
-"""Largest spread of the carriers found over the projected ones: slant and keystone change all by about one factor,
-which another set of carriers does not show. As much may part a segment's carriers from those of the whole image."""
-
-BAND_CONTRAST = 4.0
-"""Least ratio of the weakest carrier's band to what lies between bands: noise and other patterns stay below 2, the
-reference scenes lie above 15."""
-
-AGREEMENT = 0.55
-"""Least share of the filtered code words on the peaks that the model's path keeps. The reference scenes keep .66 and
-more, be they dark, ambient, blurred or clipped; wrong orders of codes keep up to .35 where the whole pattern is seen,
-and .53 where a small object shows five code words only."""
+PLAIN_AGREEMENT = 0.6
+"""Share of code words that fit below which a warning goes with the result: of the reference scenes none."""
 
 
 class CaseyDecoder(McpDecoder):
@@ -104,13 +93,13 @@ def _decode(
     upright = image
     clock = Stages()
     show("input", upright)
-    _refuse_flat(upright, camera)
+    refusals.refuse_flat(upright, camera)
     with clock.stage("stripes"):
         found = stripe_detection.detect(upright, model.stripes, model.weakest)
     show("enhanced", found.enhanced)
     show("regions", found.region)
     show.on_peaks("stripes", np.ones(len(found.peaks.y), np.uint8), found)
-    _refuse_few(found, upright)
+    refusals.refuse_few(found, upright)
     read = _read_channels(upright, found, model, clock, show)
     named = _name_peaks(read.word, found, pattern, model, clock, show)
     with clock.stage("stripes between"):
@@ -134,8 +123,7 @@ def _decode(
         "marks": len(marks.x),
         "timings_ms": {name: round(ms, 2) for name, ms in clock.ms.items()},
     }
-    warnings = () if len(marks.x) else ("stripes and carriers are there, but no stripe could be decided",)
-    return replace(decoded, details=details, warnings=warnings)
+    return replace(decoded, details=details, warnings=_warnings(details))
 
 
 # --- another way up -----------------------------------------------------------------------------------------------
@@ -171,46 +159,6 @@ def _refuse_turned(image: NDArray[Any], pattern: McpPattern, model: PatternModel
             "the pattern is turned by 90 degrees: its stripes run the other way",
             hint='the other "axis" in the description, or turn projector or camera',
         )
-
-
-# --- no pattern ---------------------------------------------------------------------------------------------------
-
-
-def _refuse_flat(image: NDArray[Any], camera: CameraFormat) -> None:
-    low, high = (float(v) for v in np.percentile(image[::4, ::4], (1, 99)))
-    if high - low < LEAST_CONTRAST * camera.max_value:
-        raise DecodeError(
-            f"no pattern: the image is uniform (grey levels {low:.0f} to {high:.0f})",
-            hint="check that the projector shows the pattern, its focus, and the exposure",
-        )
-
-
-def _refuse_few(found: stripe_detection.Stripes, image: NDArray[Any]) -> None:
-    if found.wavelength < FINEST_PX:
-        raise DecodeError(
-            f"stripes are {found.wavelength:.1f} px apart, too fine for this camera",
-            hint="project fewer bits, or move the camera closer",
-        )
-    if len(found.peaks.y) < LEAST_LIT * image.size / found.wavelength:
-        raise DecodeError("no stripes stand out", hint="check focus, exposure and what is projected")
-
-
-def _match(search: carrier_search.Search, expected: NDArray[np.float64]) -> bool:
-    """Whether the carriers found stand out, and are the expected ones times one factor."""
-    factor = search.frequency / expected
-    clear = search.complete and search.contrast >= BAND_CONTRAST
-    return clear and bool(np.ptp(factor) <= MATCH * factor.mean())
-
-
-def _refuse_carriers(search: carrier_search.Search, expected: NDArray[np.float64], width: int) -> None:
-    if _match(search, expected):
-        return
-    wanted = ", ".join(f"{f * width:.0f}" for f in expected)
-    hint = "check carriers and axis of the description, and focus"
-    if not search.complete or search.contrast < BAND_CONTRAST:
-        raise DecodeError(f"stripes, but no carriers stand out near {wanted} cycles per image", hint=hint)
-    shown = ", ".join(f"{f * width:.0f}" for f in search.frequency)
-    raise DecodeError(f"other carriers than described: {shown} cycles per image, not near {wanted}", hint=hint)
 
 
 # --- what is on the peaks -------------------------------------------------------------------------------------------
@@ -260,16 +208,16 @@ def _read_channels(
             transform = carrier_search.spectrum(level)
             folded = carrier_search.folded_psd(level, found.wavelength)
             search = carrier_search.search(folded, expected, width)
-            if k == 0 and not _match(search, expected):
+            if k == 0 and not refusals.carriers_match(search, expected):
                 search = carrier_search.search(folded, expected, width, near=True)
         title = part.name if several else ""
         show("spectrum", folded, title)
         show("bands", np.stack([search.A, search.B, search.C]), title)
         with clock.stage("carriers"):
             if k == 0:
-                _refuse_carriers(search, expected, width)
-            alike = k == 0 or np.allclose(search.frequency, searches[0].frequency, rtol=MATCH)
-            if not (alike and _match(search, expected)):
+                refusals.refuse_carriers(search, expected, width)
+            alike = k == 0 or np.allclose(search.frequency, searches[0].frequency, rtol=refusals.MATCH)
+            if not (alike and refusals.carriers_match(search, expected)):
                 # Too little of a stripe for a spectrum of its own (a small object): better read in the whole image.
                 continue
             searches.append(search)
@@ -327,12 +275,9 @@ def _name_peaks(
         sure = hidden_markov.posteriors(word, peaks.start, path, known)
     as_word = np.concatenate(([0], symbols)).astype(np.int32)
     show.on_peaks("hmm", as_word[path], found)
-    agreement = float((word[word > 0] == as_word[path[word > 0]]).mean()) if (word > 0).any() else 0.0
-    if agreement < AGREEMENT:
-        raise DecodeError(
-            f"stripes and carriers are there, but the codes contradict the description ({agreement:.0%} of them fit)",
-            hint="check bits, carriers, codes and axis of the description against what is projected",
-        )
+    with clock.stage("agreement"):
+        agreement = hidden_markov.fitting(word, path, symbols)
+        chance = refusals.refuse_order(agreement, word, peaks, symbols, (false, miss))
     with clock.stage("modal filter"):
         modal = growth.modal_filter(path, peaks, wavelength)
     show.on_peaks("hmm-modal", as_word[modal], found)
@@ -349,8 +294,24 @@ def _name_peaks(
     usual = float(sure[own].mean()) if own.any() else 0.0
     sure = np.where(own, sure, np.where(grown > 0, usual, 0)).astype(np.float32)
     index = np.concatenate(([-1], stripes)).astype(np.int32)[grown]
-    figures = {"miss_rates": [round(float(m), 4) for m in miss], "agreement": round(agreement, 4)}
+    figures = {
+        "miss_rates": [round(float(m), 4) for m in miss],
+        "agreement": round(agreement, 4),
+        "agreement_by_chance": round(chance, 4),
+    }
     return _Named(index, sure, figures)
+
+
+def _warnings(details: dict[str, Any]) -> tuple[str, ...]:
+    said = []
+    if details["marks"] == 0:
+        said.append("stripes and carriers are there, but no stripe could be decided")
+    if details["agreement"] < PLAIN_AGREEMENT:
+        said.append(
+            f"only {details['agreement']:.0%} of the code words fit the description: this decoder knows one frequency "
+            "for each carrier, and strong keystone or texture need the default decoder"
+        )
+    return tuple(said)
 
 
 # --- maps -----------------------------------------------------------------------------------------------------------

@@ -119,6 +119,13 @@ def best_paths(word: NDArray[np.int32], start: NDArray[np.int32], known: Model) 
     return _viterbi(word, start, known.start, known.step, known.emission)
 
 
+def fitting(word: NDArray[np.int32], path: NDArray[np.int32], symbols: NDArray[np.int32]) -> float:
+    """Share of the observed code words that are the symbols of the path; 0 if there are none."""
+    seen = word > 0
+    expected = np.concatenate(([0], symbols))[path[seen]]
+    return float((word[seen] == expected).mean()) if seen.any() else 0.0
+
+
 def posteriors(
     word: NDArray[np.int32], start: NDArray[np.int32], path: NDArray[np.int32], known: Model
 ) -> NDArray[np.float32]:
