@@ -118,6 +118,28 @@ class Calibration:
         moved = np.abs(far - near)
         return "y" if moved[1] >= moved[0] else "x"
 
+    @property
+    def camera_scale(self) -> tuple[float, float]:
+        """Camera pixels per projector pixel along the projector's x and y, in the image's middle, where axes meet.
+
+        On a plane that faces the camera at the depth where the two optical axes come nearest; parallel or diverging
+        axes count as four baselines away.
+        """
+        middle = np.array([(n - 1) / 2 for n in self.camera.size])
+        towards = self.rotation.T @ np.array([0.0, 0.0, 1.0])
+        ahead = np.array([0.0, 0.0, 1.0])
+        # The point of the camera's axis that is nearest to the projector's: both lines, least squares.
+        lines = np.stack((ahead, -towards), axis=1)
+        depth = float(np.linalg.lstsq(lines, self.projector_centre, rcond=None)[0][0])
+        if not 0 < depth < 1e3 * max(1.0, float(np.linalg.norm(self.projector_centre))):
+            depth = max(float(np.linalg.norm(self.projector_centre)) * 4.0, 1.0)
+        around = middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        rays = self.camera.normalised(around)
+        points = np.concatenate((rays, np.ones((3, 1))), axis=1) * depth
+        seen = self.projector.project(self.to_projector(points))
+        step_x, step_y = seen[1] - seen[0], seen[2] - seen[0]
+        return 1 / float(np.hypot(step_x[0], step_y[0])), 1 / float(np.hypot(step_x[1], step_y[1]))
+
     def as_dict(self) -> dict[str, Any]:
         """The calibration as formats.md writes it."""
         return {

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from scanner.patterns import PatternSequence
 
 PATTERN_FILE = "pattern.json"
+DEFAULT_SIZE = "1152x864"
 
 
 def patterns(
@@ -34,7 +35,11 @@ def patterns(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", parser=output_path, help="Folder to write to.")
     ],
-    size: Annotated[str, typer.Option(metavar="WxH", help="The projector's size, pixels.")] = "1152x864",
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="The projector's size, pixels.")] = None,
+    rig: Annotated[
+        str | None,
+        typer.Option("--for", metavar="RIG", help="Choose for this rig (a file, or simulated[:SCENE]), and say why."),
+    ] = None,
     frequencies: Frequencies = None,
     shifts: Shifts = None,
     axis: AxisOption = None,
@@ -61,14 +66,21 @@ def patterns(
     Examples:
       fringed patterns pmp -o images --size 1920x1080 --frequencies 1,8,64 --shifts 8 --axis x
       fringed patterns mcp -o images --size 1152x864 --gamma 2.2
+      fringed patterns mcp -o images --for bench.toml
       fringed patterns gray -o images --bits 10
     """
     from scanner.errors import ScannerError  # noqa: PLC0415
     from scanner.storage import prepare_output, replace_json  # noqa: PLC0415
 
     members = PatternOptions(frequencies, shifts, axis, bits, carriers, profile, levels).members(method)
+    if rig is not None and size is not None:
+        raise typer.BadParameter("--size and --for exclude each other: the rig has a size")
     try:
-        sequence = _sequence(method, members, _size(size), gamma, bracketed=bracketed)
+        why: dict[str, str] = {}
+        projector_size = _size(size or DEFAULT_SIZE)
+        if rig is not None:
+            projector_size, members, why = _for_rig(rig, method, members)
+        sequence = _sequence(method, members, projector_size, gamma, bracketed=bracketed)
     except ScannerError as error:
         raise typer.BadParameter(f"{error}{f' ({error.hint})' if error.hint else ''}") from error
     prepare_output(output, force=force)
@@ -88,9 +100,10 @@ def patterns(
         }
         replace_json(output / PATTERN_FILE, content)
     if as_json:
-        print_json({"folder": str(output), **content})
+        print_json({"folder": str(output), **content, "why": why})
     else:
-        print_facts("patterns", [("images", len(names)), ("description", output / PATTERN_FILE)])
+        facts = [("images", len(names)), ("description", output / PATTERN_FILE), *why.items()]
+        print_facts("patterns", facts)
     return 0
 
 
@@ -99,6 +112,26 @@ def _size(text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal() and 2 <= int(width) <= 16_384 and 2 <= int(height) <= 16_384):
         raise typer.BadParameter(f"--size: expected WIDTHxHEIGHT in pixels, 2 .. 16384 each, got {text!r}")
     return int(width), int(height)
+
+
+def _for_rig(
+    name: str, method: Method, members: dict[str, Any]
+) -> tuple[tuple[int, int], dict[str, Any], dict[str, str]]:
+    """The rig's projector size, the pattern's members, and the reasons of those that were chosen here."""
+    from scanner.patterns.mcp_choice import choose_mcp  # noqa: PLC0415
+    from service.rig_patterns import known_rig  # noqa: PLC0415
+
+    rig = known_rig(name)
+    size = (rig.projector.width, rig.projector.height)
+    if method is not Method.MCP:
+        axes = {"axis": rig.axis} if method is Method.CP else {"axes": [rig.axis]}
+        return size, {**axes, **members}, {"axis": f"{rig.axis}: the projected axis that moves with depth"}
+    choice = choose_mcp(rig.projector, members.get("axis", rig.axis), rig.camera_scale or (1.0, 1.0))
+    chosen = choice.pattern.describe()
+    why = {key: said for key, said in choice.why.items() if key not in members}
+    if rig.camera_scale is None:
+        why["camera"] = "no calibration: taken as one pixel for each of the projector's"
+    return size, {**chosen, **members}, why
 
 
 def _sequence(

@@ -1,0 +1,72 @@
+"""The MCP pattern chosen for a projector and a camera."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.simulated.rigs import rig
+from scanner.errors import DecodeError
+from scanner.patterns import ProjectorSize
+from scanner.patterns.mcp import McpPattern
+from scanner.patterns.mcp_choice import choose_mcp
+from service.cli import main
+
+SIZES = [(1152, 864), (1920, 1080), (912, 1140), (1024, 768), (320, 240), (3840, 2160)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("axis", ["x", "y"])
+@pytest.mark.parametrize("scale", [0.5, 1.0, 1.5, 3.0])
+def test_whatever_is_chosen_is_a_pattern_of_that_projector(size, axis, scale):
+    projector = ProjectorSize(*size)
+    choice = choose_mcp(projector, axis, (scale, scale))
+    choice.pattern.validate(projector)
+    across = projector.along("x" if axis == "y" else "y")
+    finest = across / max(choice.pattern.carriers)
+    assert finest * scale > 2 / 0.58, "a carrier near the camera's Nyquist frequency"
+    assert choice.why.keys() == {"axis", "bits", "carriers", "profile", "codes"}
+
+
+def test_a_finer_camera_gets_finer_carriers_and_never_coarser_ones():
+    carriers = [max(choose_mcp(ProjectorSize(1920, 1080), "x", (s, s)).pattern.carriers) for s in (0.3, 0.6, 1, 2, 5)]
+    assert carriers == sorted(carriers)
+
+
+def test_stripes_that_the_camera_cannot_tell_apart_become_fewer():
+    projector = ProjectorSize(1152, 864)
+    bits = [choose_mcp(projector, "y", (1.0, scale)).pattern.bits for scale in (1.0, 0.2, 0.1)]
+    assert bits == [4, 3, 2]
+
+
+def test_the_reference_rigs_get_what_the_default_was_found_to_be():
+    calibration = rig("casey2011").calibration
+    choice = choose_mcp(ProjectorSize(*calibration.projector.size), "y", calibration.camera_scale)
+    assert choice.pattern.carriers == pytest.approx(McpPattern().carriers, abs=2)
+    assert choice.pattern.codes == McpPattern().codes
+
+
+def test_too_coarse_is_said():
+    with pytest.raises(DecodeError, match="too coarse for mcp") as caught:
+        choose_mcp(ProjectorSize(64, 48), "y")
+    assert "pmp" in caught.value.hint
+
+
+def test_the_cameras_scale_is_that_of_a_wall_where_the_axes_meet(rig_of):
+    """Camera 620 px at 700 mm; projector 700 and 690 px at 728 mm, turned by 16 degrees about y."""
+    turned = np.cos(np.arctan2(200, 700))
+    camera, projector = 620 / 700, np.array([700, 690]) / np.hypot(200, 700)
+    scale = rig_of("x").camera_scale
+    assert scale[0] == pytest.approx(camera / (projector[0] * turned), rel=0.01)
+    assert scale[1] == pytest.approx(camera / projector[1], rel=0.01)
+
+
+def test_the_choice_for_a_rig_is_written_and_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["patterns", "mcp", "-o", str(tmp_path / "p"), "--for", "simulated:quick/board", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["projector"] == {"width": 320, "height": 240}
+    assert "camera pixels" in told["why"]["carriers"]
+    assert json.loads((tmp_path / "p" / "pattern.json").read_text())["pattern"] == told["pattern"]
