@@ -8,17 +8,19 @@ nobody's help. What noise destroyed is asked again; what cannot be had again is 
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
 from drivers.serial_trigger.clock_fit import ClockFit, Reading
-from drivers.serial_trigger.link import Link, NoAnswerError
+from drivers.serial_trigger.link import Link, NoAnswerError, RefusedError
 from drivers.serial_trigger.protocol import (
     BoardState,
     EventsLost,
     Message,
+    Ok,
     Pulse,
     Ready,
     RunEnded,
@@ -28,9 +30,11 @@ from drivers.serial_trigger.protocol import (
 )
 from scanner.clock import Clock
 from scanner.devices import Source, TableSlot, TriggerCapabilities, TriggerEvent, TriggerFault, TriggerSource
-from scanner.errors import DeviceBusy, DeviceError, DeviceLost
+from scanner.errors import DeviceBusy, DeviceError
 from scanner.trigger_protocol import CAPABILITIES, EVENTS_KEPT, OUTPUTS
 from scanner.trigger_table import BoardTable, board_table
+
+_log = logging.getLogger(__name__)
 
 BYTE_NS = 84_000
 """A byte takes at least this on the wire: 10 bits at the fastest that a UART may be to be understood at 115200"""
@@ -76,6 +80,8 @@ class _Run:
     """What was heard of the run since `arm`."""
 
     number: int
+    breaks: int
+    """of the clock's fit, when it began"""
     pulses: dict[int, tuple[int, int]] = field(default_factory=dict)
     """by their count since ARM: slot, and board time (unwrapped)"""
     events: dict[int, TriggerEvent] = field(default_factory=dict)
@@ -139,10 +145,11 @@ class SerialTriggerBoard:
         self._check_open()
         folded = board_table(table, source, CAPABILITIES, self.name)
         self._reconnect_if_lost()
-        self._check_idle()
+        self._clear()
         self._table, self._source = folded, source
         self._emitting = tuple(i for i, step in enumerate(folded.steps) if step.emit)
-        self._load()
+        self._fill(folded)
+        self._read_clock()
 
     def arm(self) -> None:
         """Wait for the source; see `scanner.devices.TriggerBoard.arm`. A lost board is looked for again."""
@@ -150,24 +157,30 @@ class SerialTriggerBoard:
         if self._table is None:
             raise DeviceError("nothing is programmed", device=self.name, hint="load a table before arming")
         self._reconnect_if_lost()
-        self._check_idle()
         self._listen()
+        if self._loaded:
+            try:
+                self._once("ARM", done=("ARMED", "RUNNING"), again=("IDLE",))
+            except RefusedError:
+                if self._state().state != "IDLE":
+                    raise self._busy() from None
+                self._loaded = False  # it has begun anew, and noise took its word of it
         if not self._loaded:
-            self._load()
-        self._read_clock()
-        self._listen()
-        self._run = _Run(self._runs)
-        self._runs += 1
-        self._once("ARM", done=("ARMED", "RUNNING"), again=("IDLE",))
+            self._clear()
+            self._fill(self._table)
+            self._read_clock()
+            self._once("ARM", done=("ARMED", "RUNNING"), again=("IDLE",))
+        self._begin_run()
 
     def fire(self) -> None:
         """Start the table now; see `scanner.devices.TriggerBoard.fire`."""
         self._check_open()
         if self._source is not TriggerSource.INTERNAL:
             raise DeviceError(f"the source is {self._source.value}, not INT", device=self.name)
-        if self._state().state != "ARMED":
-            raise DeviceError("the board is not armed", device=self.name, hint="arm it first")
-        self._once("FIRE", done=("RUNNING", "IDLE"), again=("ARMED",))
+        try:
+            self._once("FIRE", done=("RUNNING", "IDLE"), again=("ARMED",))
+        except RefusedError as error:
+            raise DeviceError("the board is not armed", device=self.name, hint="arm it first") from error
 
     def abort(self) -> None:
         """Stop, outputs low; see `scanner.devices.TriggerBoard.abort`."""
@@ -200,13 +213,16 @@ class SerialTriggerBoard:
 
     # --- the table and its start ---------------------------------------------------------------------------------
 
-    def _load(self) -> None:
-        table = self._table
-        if table is None:
-            return
+    def _clear(self) -> None:
+        """Empty the board's table, which it does only while idle."""
+        try:
+            self._link.ask("SEQ:CLEAR")
+        except RefusedError as error:
+            raise self._busy() from error
         self._loaded = False
+
+    def _fill(self, table: BoardTable) -> None:
         ask = self._link.ask
-        ask("SEQ:CLEAR")
         mask = sum(OUTPUTS[name] for name in self._options.outputs)
         for i, step in enumerate(table.steps):
             self._add(i, f"SEQ:ADD {step.dark_us},{step.exposure_us},{mask if step.emit else 0},{step.edges}")
@@ -251,9 +267,7 @@ class SerialTriggerBoard:
     def _ran_since(self, t_ns: int) -> bool:
         try:
             pulse = pulse_from(self._link.ask("EVT? 0"))
-        except DeviceLost:
-            raise
-        except DeviceError:
+        except RefusedError:
             return False
         if pulse is None:
             return False
@@ -299,6 +313,18 @@ class SerialTriggerBoard:
             elif self._run is not None:
                 self._note(self._run, message)
 
+    def _begin_run(self) -> None:
+        """From ARM's answer on lines are of this run; those before it are of the run before."""
+        self._run = None
+        heard: list[Message] = []
+        while self._heard:
+            heard.append(self._heard.popleft())
+        answers = [i for i, message in enumerate(heard) if isinstance(message, Ok)]
+        self._run = _Run(self._runs, self.clock_fit.breaks)
+        self._runs += 1
+        for message in heard[answers[-1] + 1 if answers else 0 :]:
+            self._note(self._run, message)
+
     def _note(self, run: _Run, message: Message) -> None:
         if isinstance(message, Pulse):
             count = self._count(message)
@@ -340,9 +366,7 @@ class SerialTriggerBoard:
             if missing >= count - EVENTS_KEPT:
                 try:
                     pulse = pulse_from(self._link.ask(f"EVT? {missing}"))
-                except DeviceLost:
-                    raise
-                except DeviceError:
+                except RefusedError:
                     pulse = None  # it has forgotten that one meanwhile
             if pulse is not None and self._count(pulse) == missing:
                 run.pulses[missing] = (self._slot(pulse.run, pulse.step), self._unwrapped(pulse.t_us))
@@ -372,7 +396,9 @@ class SerialTriggerBoard:
             return run.events[count]
         slot, board_us = run.pulses[count]
         host = self.clock_fit.at(board_us)
-        event = TriggerEvent(run.number, slot, host.t_ns, host.bound_ns + EVENT_NS, Source.HARDWARE)
+        # A clock that contradicted itself in this run may have done so before this event, or after it.
+        source = Source.HARDWARE if self.clock_fit.breaks == run.breaks else Source.ESTIMATED
+        event = TriggerEvent(run.number, slot, host.t_ns, host.bound_ns + EVENT_NS, source)
         if self.clock_fit.last_us is not None and self.clock_fit.last_us > board_us:
             run.events[count] = event
         return event
@@ -386,8 +412,11 @@ class SerialTriggerBoard:
         high = answer.heard_ns - answer.heard_bytes * BYTE_NS
         if low > high:  # a line faster than any UART: a pty without one
             low, high = answer.sent_ns, answer.heard_ns
+        breaks = self.clock_fit.breaks
         self.clock_fit.add(Reading(self._unwrapped(int(answer.value)), low, high + EVENT_NS))
         self._read_ns = answer.heard_ns
+        if self.clock_fit.breaks != breaks:
+            _log.warning("%s: its clock does not run evenly with this machine's: event times are estimates", self.name)
 
     # --- there or not --------------------------------------------------------------------------------------------
 
@@ -399,9 +428,8 @@ class SerialTriggerBoard:
         if self._link.lost is not None:
             raise self._link.lost
 
-    def _check_idle(self) -> None:
-        if self._state().state != "IDLE":
-            raise DeviceBusy("a run is under way", device=self.name, hint="wait for its end, or abort it first")
+    def _busy(self) -> DeviceBusy:
+        return DeviceBusy("a run is under way", device=self.name, hint="wait for its end, or abort it first")
 
     def _reconnect_if_lost(self) -> None:
         if self._link.lost is not None:

@@ -47,6 +47,14 @@ class Timed:
     heard_bytes: int
 
 
+class RefusedError(DeviceError):
+    """The board does not do it; `refusal` is its number, of `scanner.trigger_protocol.ERRORS`."""
+
+    def __init__(self, message: str, refusal: int, *, device: str | None = None, hint: str | None = None) -> None:
+        super().__init__(message, device=device, hint=hint)
+        self.refusal = refusal
+
+
 class NoAnswerError(DeviceError):
     """Whether a request that must not be repeated was obeyed is not known."""
 
@@ -55,7 +63,7 @@ class Link:
     """A transport with a conversation on it."""
 
     def __init__(self, transport: Transport, clock: Clock, on_message: Callable[[Message], None]) -> None:
-        """Begin to read. on_message is called on the reader's thread for what the board says by itself."""
+        """Begin to read. on_message is called on the reader's thread, for every whole line in its order."""
         self._transport = transport
         self._clock = clock
         self._on_message = on_message
@@ -90,7 +98,7 @@ class Link:
         Raises:
             DeviceLost: the port went away, or the board is silent.
             NoAnswerError: not `repeat`, and no answer came.
-            DeviceError: the board refuses.
+            RefusedError: the board refuses.
         """
         return self.ask_timed(command, repeat=repeat, tries=tries).value
 
@@ -110,8 +118,9 @@ class Link:
                     self._wait_for_quiet()  # the answer that stayed out may only have been late
                 return Timed(heard[1].value, sent, heard[0], len(request), len(framed(_said(heard[1]))))
             elif isinstance(heard[1], Refusal) and not self._is_noise(heard[1]):
-                raise DeviceError(
+                raise RefusedError(
                     f"the board refuses {command}: {heard[1].text} ({heard[1].code})",
+                    heard[1].code,
                     device=self.name,
                     hint="see docs/reference/trigger-protocol.md",
                 )
@@ -157,10 +166,9 @@ class Link:
                 self.heard_ns = now
                 if isinstance(message, Ready):
                     self._reader.need_sum = False  # it has begun anew, and gives none until it is told to
+                self._on_message(message)
                 if isinstance(message, Ok | Refusal):
                     self._answers.put((now, message))
-                else:
-                    self._on_message(message)
 
     def _give_up(self, lost: DeviceLost) -> None:
         self.lost = lost

@@ -354,6 +354,8 @@ class TriggerBench:
     """no further vertical blank comes"""
     unplug: Callable[[], None] | None
     """the board is gone at once; None where the bench cannot"""
+    uneven_ns: int = 0
+    """by which the board's own time may be off: a chip simulated in real time stands still while others compute"""
 
     def wait(self, ns: int) -> None:
         """Let time pass."""
@@ -402,8 +404,8 @@ class TriggerContract:
         returned = bench.clock.now_ns()
         events = bench.events(6)
         first = events[0]
-        assert called + 7_000_000 - first.bound_ns - bench.board.capabilities.jitter_ns <= first.t_ns
-        assert first.t_ns <= returned + 7_000_000 + first.bound_ns + SECOND_NS // 100
+        slack = first.bound_ns + bench.board.capabilities.jitter_ns + bench.uneven_ns
+        assert called + 7_000_000 - slack <= first.t_ns <= returned + 7_000_000 + slack + SECOND_NS // 100
         self._spaced(bench, events, [10_000_000] * 5)
         assert list(bench.board.faults()) == []
 
@@ -440,7 +442,7 @@ class TriggerContract:
     def test_event_times_are_known_with_a_bound(self, bench: TriggerBench) -> None:
         for event in bench.run(self._slots(3), TriggerSource.VSYNC, 3):
             assert 0 < event.bound_ns < SECOND_NS // 50
-            assert event.t_ns - event.bound_ns <= bench.clock.now_ns()
+            assert event.t_ns - event.bound_ns <= bench.clock.now_ns() + bench.uneven_ns
 
     def test_runs_are_numbered_and_forget_the_one_before(self, bench: TriggerBench) -> None:
         assert [event.sequence for event in bench.run(self._slots(2), TriggerSource.VSYNC, 2)] == [0, 0]
@@ -558,6 +560,7 @@ class TriggerContract:
         assert len(events) == len(wanted_ns) + 1
         for wanted, (before, after) in zip(wanted_ns, itertools.pairwise(events), strict=True):
             slack = before.bound_ns + after.bound_ns + 2 * bench.board.capabilities.jitter_ns + wanted // 10_000
+            slack += bench.uneven_ns
             assert abs(after.t_ns - before.t_ns - wanted) <= slack
 
     @staticmethod

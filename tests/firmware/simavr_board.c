@@ -5,7 +5,8 @@
  *                                    on stdin; ends with stdin
  *
  * Actions of a script, in order of cycles:   CYCLE byte HEX  |  CYCLE VSYNC 0|1  |  CYCLE EXT 0|1  |  CYCLE end
- * Log:   CYCLE PIN 0|1  |  CYCLE line TEXT  |  pty PATH  |  CYCLE lap  (when a lap of timer 1 began, at the end)
+ * Log of a script:   CYCLE PIN 0|1  |  CYCLE line TEXT  |  CYCLE lap  (when a lap of timer 1 began, at the end)
+ * With a pty its path is all:   pty PATH
  *
  * simavr 1.6 models the compare outputs loosely: it sets them at overflow in every mode, knows no match by command
  * (FOC1x), and any write to the port changes them. So they are modelled here, from the timer's own matches, as the
@@ -37,10 +38,12 @@ enum { REG_PORTB = 0x25, REG_DDRB = 0x24, REG_TCCR1A = 0x80, REG_TCCR1C = 0x82 }
 
 static avr_t *avr;
 static avr_timer_t *timer;
+static bool scripted;
 
 static void log_pin(avr_cycle_count_t cycle, const char *pin, int level)
 {
-    printf("%llu %s %d\n", (unsigned long long)cycle, pin, level);
+    if (scripted) /* nobody reads along with a board that runs in real time */
+        printf("%llu %s %d\n", (unsigned long long)cycle, pin, level);
 }
 
 /* --- the compare outputs ------------------------------------------------------------------------------------------ */
@@ -312,15 +315,15 @@ static void make_board(const char *path)
 int main(int argc, char **argv)
 {
     avr_irq_t *output;
-    bool script = argc == 3 && strcmp(argv[2], "script") == 0;
 
-    if (!script && (argc < 3 || strcmp(argv[2], "pty") != 0)) {
+    scripted = argc == 3 && strcmp(argv[2], "script") == 0;
+    if (!scripted && (argc < 3 || strcmp(argv[2], "pty") != 0)) {
         fprintf(stderr, "usage: simavr_board ELF script | simavr_board ELF pty [VSYNC_US]\n");
         return 2;
     }
     make_board(argv[1]);
     output = avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT);
-    if (script) {
+    if (scripted) {
         avr_irq_register_notify(output, on_byte_to_log, NULL);
         if (!next_action())
             return 2;

@@ -20,7 +20,7 @@ from drivers.serial_trigger import driver, ports, transport, trigger_driver
 from drivers.serial_trigger.board import SerialTriggerBoard
 from drivers.simulated.serial_board_pty import LineFaults, PtyBoard
 from scanner.clock import MonotonicClock
-from scanner.devices import TableSlot, TriggerEvent, TriggerSource
+from scanner.devices import Source, TableSlot, TriggerEvent, TriggerSource
 from scanner.errors import (
     ConfigError,
     DeviceBusy,
@@ -77,6 +77,25 @@ def test_events_are_at_their_true_time_within_their_bound(ppm: float) -> None:
         assert fit.rate_bound < 5e-3
         assert fit.breaks == 0
         assert events[0].bound_ns < 2_000_000
+        assert {event.source for event in events} == {Source.HARDWARE}
+
+
+def test_a_clock_that_runs_unevenly_is_noticed(caplog: pytest.LogCaptureFixture) -> None:
+    """The board's clock jumps in the middle of a run: times are estimates from then on, and a warning says so."""
+    with PtyBoard(vsync_us=VSYNC_US) as there, opened(there.path) as board:
+        started(board, 1_000)
+        events_of(board, 5)
+        there.jump(200_000_000)
+        deadline = time.monotonic() + 2
+        while board.clock_fit.breaks == 0 and time.monotonic() < deadline:
+            board.events()
+            time.sleep(0.01)
+        assert board.events()[-1].source is Source.ESTIMATED
+        assert "does not run evenly" in caplog.text
+        board.abort()
+        time.sleep(0.02)
+        board.arm()
+        assert {event.source for event in events_of(board, 3)[:3]} == {Source.HARDWARE}
 
 
 # --- noise ----------------------------------------------------------------------------------------------------------
