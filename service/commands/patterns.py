@@ -35,7 +35,9 @@ def patterns(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", parser=output_path, help="Folder to write to.")
     ],
-    size: Annotated[str | None, typer.Option(metavar="WxH", help="The projector's size, pixels.")] = None,
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="The projector's size, pixels (1152x864 where nothing is said).")
+    ] = None,
     rig: Annotated[
         str | None,
         typer.Option("--for", metavar="RIG", help="Choose for this rig (a file, or simulated[:SCENE]), and say why."),
