@@ -166,7 +166,9 @@ def sequence_for(opened: OpenRig, params: ScanStart) -> PatternSequence:
     try:
         pattern = pattern_for(params.method, params.pattern or {}, axis, projector)
         check_length(pattern.fringe_count, params.repeat)
-        return PatternSequence.bracketed(projector, pattern, _precorrection(opened.calibration))
+        # A position as in a description, or true from the command line: full-on and full-off frames beside the pattern.
+        white = isinstance(pattern, McpPattern) and (params.pattern or {}).get("white") not in (None, False)
+        return PatternSequence.bracketed(projector, pattern, _precorrection(opened.calibration), white=white)
     except DecodeError as error:
         raise ConfigError(error.message, hint=error.hint) from error
 

@@ -87,26 +87,31 @@ class PatternSequence:
 
     @classmethod
     def bracketed(
-        cls, projector: ProjectorSize, pattern: Pattern, precorrection: Precorrection | None = None
+        cls,
+        projector: ProjectorSize,
+        pattern: Pattern,
+        precorrection: Precorrection | None = None,
+        *,
+        white: bool = False,
     ) -> PatternSequence:
         """The sequence to capture: a multi-frame pattern gets sentinels, order bars and what its method needs.
 
-        One-frame patterns are projected alone.
+        One-frame patterns are projected alone, unless `white` asks for a full-on and a full-off frame beside them.
 
         Raises:
             DecodeError: the pattern does not fit the projector.
         """
         pattern.validate(projector)
-        if pattern.fringe_count == 1:
+        if pattern.fringe_count == 1 and not white:
             return cls(projector, pattern, precorrection=precorrection)
         before, after = len(SENTINELS_BEFORE), len(SENTINELS_AFTER)
         axes: tuple[Axis, ...] = getattr(pattern, "axes", ())
-        white, black = (before, before + 1) if pattern.method == "gray" else (None, None)
-        first = before + (2 if white is not None else 0) + pattern.fringe_count
+        full, dark = (before, before + 1) if pattern.method == "gray" or white else (None, None)
+        first = before + (2 if full is not None else 0) + pattern.fringe_count
         bars = {axis: first + i for i, axis in enumerate(axes)} if pattern.method in ("pmp", "gray") else {}
         end = first + len(bars)
         sentinels = (*range(before), *range(end, end + after))
-        return cls(projector, pattern, white, black, sentinels, bars, precorrection)
+        return cls(projector, pattern, full, dark, sentinels, bars, precorrection)
 
     @classmethod
     def from_description(cls, projector: ProjectorSize, description: Mapping[str, Any]) -> PatternSequence:

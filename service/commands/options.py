@@ -67,6 +67,10 @@ Carriers = Annotated[
 Profile = Annotated[str | None, typer.Option(metavar="triangle|cosine", help="MCP: shape of a stripe.")]
 Levels = Annotated[str | None, typer.Option(metavar="equal|composite", help="MCP: equally bright, or as published.")]
 
+White = Annotated[
+    bool, typer.Option("--white", help="MCP: frames full on and off too, for textured scenes that stand still.")
+]
+
 
 @dataclass(frozen=True)
 class PatternOptions:
@@ -79,6 +83,7 @@ class PatternOptions:
     carriers: str | None = None
     profile: str | None = None
     levels: str | None = None
+    white: bool | None = None
 
     def members(self, method: Method) -> dict[str, Any]:
         """Members of the pattern's description that were said.
@@ -88,7 +93,7 @@ class PatternOptions:
         """
         allowed = {
             Method.PMP: {"frequencies", "shifts", "axis"},
-            Method.MCP: {"axis", "bits", "carriers", "profile", "levels"},
+            Method.MCP: {"axis", "bits", "carriers", "profile", "levels", "white"},
             Method.GRAY: {"axis", "bits"},
             Method.CP: {"axis", "carriers"},
         }[method]
@@ -100,6 +105,8 @@ class PatternOptions:
             for name, choices in (("profile", ("triangle", "cosine")), ("levels", ("equal", "composite")))
             if name in given
         }
+        if "white" in given:
+            members["white"] = True
         if "axis" in given:
             members |= _axes(given["axis"], method)
         if "bits" in given:

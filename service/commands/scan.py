@@ -31,6 +31,7 @@ from service.commands.options import (
     PatternOptions,
     Profile,
     Shifts,
+    White,
     filter_members,
 )
 from service.commands.summary import report_result
@@ -65,6 +66,7 @@ def scan(
     carriers: Carriers = None,
     profile: Profile = None,
     levels: Levels = None,
+    white: White = False,
     repeat: Annotated[
         int, typer.Option(metavar="N", min=1, max=1000, help="Repetitions of the whole sequence, averaged.")
     ] = 1,
@@ -93,7 +95,7 @@ def scan(
     """
     if rig is not None and connect is not None:
         raise typer.BadParameter("--rig and --connect exclude each other: a running daemon has a rig of its own")
-    members = PatternOptions(frequencies, shifts, axis, bits, carriers, profile, levels).members(method)
+    members = PatternOptions(frequencies, shifts, axis, bits, carriers, profile, levels, white or None).members(method)
     params: dict[str, Any] = {
         "pattern": members or None,
         "exposure": None if exposure is None else exposure_given(exposure),

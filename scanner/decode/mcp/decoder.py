@@ -19,6 +19,7 @@ from scanner.decode.frames import FrameCheck
 from scanner.decode.mcp import dense, emissions, hmm, linking, magnification, stripes, subpixel
 from scanner.decode.mcp.locate import Array, Found, Image, Known, Stages, locate
 from scanner.decode.mcp.model import PatternModel
+from scanner.decode.mcp.white import RATIO_BITS, divided, in_grey_levels
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
 
@@ -175,6 +176,7 @@ class McpDecoder:
         self._check = FrameCheck(self._sequence, self._camera)
         self._image: NDArray[Any] | None = None
         self._black: NDArray[Any] | None = None
+        self._white: NDArray[Any] | None = None
 
     def add(self, position: int, frame: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
         """Take the frame at `position`; see `scanner.decode.Decoder`."""
@@ -183,12 +185,31 @@ class McpDecoder:
             self._image = frame.copy()
         elif position == self._sequence.black:
             self._black = frame.copy()
+        elif position == self._sequence.white:
+            self._white = frame.copy()
 
     def finish(self) -> Decoded:
         """The maps; see `scanner.decode.Decoder`."""
         known, self._known = self._known, None  # a frame that is refused teaches nothing
-        decoded, self._known = decode_next(self.frame(), self._pattern, self._sequence.projector, self._camera, known)
-        return decoded
+        size = self._sequence.projector
+        if self._white is None:
+            decoded, self._known = decode_next(self.frame(), self._pattern, size, self._camera, known)
+            return decoded
+        image, white, black = (
+            None if frame is None else grey(frame, self._camera) for frame in (self._image, self._white, self._black)
+        )
+        if image is None or white is None:
+            self.frame()
+            raise AssertionError("frame() raises without the MCP frame")
+        camera = CameraFormat(self._camera.width, self._camera.height, RATIO_BITS)
+        ratio = divided(image, white, black, self._camera.max_value)
+        decoded, self._known = decode_next(ratio, self._pattern, size, camera, known)
+        return replace(
+            decoded,
+            albedo=in_grey_levels(decoded.albedo, white, black),
+            modulation=in_grey_levels(decoded.modulation, white, black),
+            details={**decoded.details, "divided_by_white": True},
+        )
 
     def frame(self) -> NDArray[Any]:
         """The one frame, the black one taken off where there is one.
@@ -226,13 +247,23 @@ _MOSAICS = {
 }
 
 
+def grey(image: NDArray[Any], camera: CameraFormat) -> Image:
+    """One channel of light: a colour camera's mosaic is interpolated.
+
+    Raises:
+        DecodeError: a mosaic that is not known.
+    """
+    if camera.mosaic is None:
+        return image
+    if camera.mosaic not in _MOSAICS:
+        raise DecodeError(f"unknown mosaic {camera.mosaic!r}", hint=f"known: {', '.join(sorted(_MOSAICS))}")
+    return np.asarray(cv2.cvtColor(image, _MOSAICS[camera.mosaic]))
+
+
 def upright_image(image: NDArray[Any], pattern: McpPattern, camera: CameraFormat) -> Image:
     """Checked, grey, with horizontal stripes, contiguous."""
     _check_frame(image, camera, 0)
-    if camera.mosaic is not None:
-        if camera.mosaic not in _MOSAICS:
-            raise DecodeError(f"unknown mosaic {camera.mosaic!r}", hint=f"known: {', '.join(sorted(_MOSAICS))}")
-        image = cv2.cvtColor(image, _MOSAICS[camera.mosaic])
+    image = grey(image, camera)
     turned = image if pattern.axis == "y" else image.T
     if min(turned.shape) < 32:
         raise DecodeError(f"an image of {image.shape[1]} x {image.shape[0]} is smaller than a few stripes")

@@ -1,0 +1,91 @@
+"""MCP with a frame full on beside the pattern's: what is printed on the scene is divided out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import typer
+
+from scanner.decode import decoder_for
+from scanner.decode.mcp import white
+from scanner.errors import DecodeError
+from scanner.patterns import PatternSequence
+from service.commands.options import Method, PatternOptions
+from tests.unit.test_decode_mcp import CAMERA, OWN, PROJECTOR, render
+
+
+def printed():
+    """A chequer of 24 px in dark and light grey, 1 : 12."""
+    y, x = np.mgrid[: CAMERA.height, : CAMERA.width]
+    return np.where((y // 24 + x // 24) % 2, 0.9, 0.075)
+
+
+def frames(ambient=0.04):
+    """The pattern's frame, the white, the black one, and the truth."""
+    albedo = printed()
+    pattern, truth = render(OWN, albedo=albedo)
+    random = np.random.default_rng(2)
+    full, dark = (
+        np.rint(np.clip(albedo * light * 255 + random.normal(0, 1.5, albedo.shape), 0, 255)).astype(np.uint8)
+        for light in (1 + ambient, ambient)
+    )
+    return pattern, full, dark, truth
+
+
+def decode(sequence, given):
+    decoder = decoder_for(sequence, CAMERA)
+    for position, frame in given.items():
+        decoder.add(position, frame)
+    return decoder.finish()
+
+
+def test_print_is_divided_out_and_the_maps_are_in_grey_levels():
+    pattern, full, dark, truth = frames()
+    with pytest.raises(DecodeError):  # so strong a print hides the codes from one frame
+        decode(PatternSequence(PROJECTOR, OWN), {0: pattern})
+    plain = decode(PatternSequence(PROJECTOR, OWN), {0: render(OWN, albedo=0.9)[0]})
+    two = decode(PatternSequence(PROJECTOR, OWN, white=1), {0: pattern, 1: full})
+    three = decode(PatternSequence(PROJECTOR, OWN, white=0, black=1), {2: pattern, 0: full, 1: dark})
+    for decoded in (two, three):
+        good = np.isfinite(decoded.rows)
+        assert good.mean() > 0.9
+        assert np.median(np.abs(decoded.rows - truth)[good]) < 0.1
+        bright, dim = printed() > 0.5, printed() < 0.5
+        ratio = np.median(decoded.albedo[good & bright]) / np.median(decoded.albedo[good & dim])
+        assert ratio == pytest.approx(12, rel=0.1)
+        assert np.median(decoded.albedo[good & bright]) == pytest.approx(np.median(plain.albedo[good & bright]), rel=0.25)
+
+
+def test_what_is_dark_in_the_white_frame_is_nothing_and_what_is_clipped_says_so():
+    image, full = np.full((64, 64), 60, np.uint8), np.full((64, 64), 120, np.uint8)
+    full[:8] = 3
+    image[-8:] = 255
+    ratio = white.divided(image, full, None, 255)
+    assert (ratio[:8] == 0).all()
+    assert (ratio[8:-8] == white.ONE // 2).all()
+    assert (ratio[-8:] == 4095).all()
+
+
+def test_a_dark_white_frame_is_refused():
+    pattern, *_ = frames()
+    sequence = PatternSequence(PROJECTOR, OWN, white=1)
+    with pytest.raises(DecodeError, match="white frame is dark"):
+        decode(sequence, {0: pattern, 1: np.full(CAMERA.shape, 4, np.uint8)})
+    with pytest.raises(DecodeError, match="missing"):
+        decode(sequence, {1: np.full(CAMERA.shape, 200, np.uint8)})
+
+
+def test_the_sequence_with_white_is_bracketed_and_described():
+    sequence = PatternSequence.bracketed(PROJECTOR, OWN, white=True)
+    assert sequence.white == 3
+    assert sequence.black == 4
+    assert sequence.fringes == (5,)
+    assert len(sequence.sentinels) == 6
+    assert PatternSequence.from_description(PROJECTOR, sequence.describe()) == sequence
+    assert len(PatternSequence.bracketed(PROJECTOR, OWN)) == 1
+
+
+def test_the_option_is_for_mcp_alone():
+    assert PatternOptions(white=True).members(Method.MCP) == {"white": True}
+    with pytest.raises(typer.BadParameter, match="--white"):
+        PatternOptions(white=True).members(Method.PMP)
