@@ -39,7 +39,19 @@ def addresses_of(frames: Sequence[NDArray[Any]]) -> NDArray[np.intp]:
 @kernel
 def pixels_at(address: int, first: int, count: int, like: NDArray[Any]) -> NDArray[Any]:
     """Pixels first .. first + count - 1 of the frame at `address`, no copy; of the dtype of `like`. For kernels."""
-    return _carray(_pointer(address + first * like.itemsize), (count,), like.dtype)
+    pixels: NDArray[Any] = _carray(_pointer(address + first * like.itemsize), (count,), like.dtype)
+    return pixels
+
+
+@kernel
+def aligned_rows(rows: int, length: int) -> NDArray[np.float32]:
+    """(rows, length) float32 whose rows begin with a cache line, for lengths that are multiples of 16. For kernels.
+
+    Vector registers are as wide as a line: what lies across two of them takes twice as long to load or store.
+    """
+    block = np.empty(rows * length + CACHE_LINE // 4, np.float32)
+    skip = (-block.ctypes.data % CACHE_LINE) // 4
+    return block[skip : skip + rows * length].reshape(rows, length)
 
 
 @kernel

@@ -2,28 +2,33 @@
 
 The position is the centre of the cell that the projected bits name (formats.md). A pixel on the border of two cells
 leaves one bit open; where both values name neighbouring cells it is decided all the same, everywhere else an open bit
-leaves the pixel undecided. Frames are kept until an axis is whole and then decoded in one pass.
+leaves the pixel undecided. Frames are kept and decoded in one pass over all of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Map, Reason
+from scanner.decode.addresses import addresses_of, aligned_rows
 from scanner.decode.frames import FrameCheck
-from scanner.decode.graycode_kernels import BOTH, INVERSE, PLAIN, decode_bits
+from scanner.decode.graycode_kernels import BOTH, INVERSE, PLAIN, decode_codes, gather
 from scanner.decode.noise import ROUNDING_VARIANCE, default_noise
+from scanner.decode.reasons import REASONS
+from scanner.decode.runs import runs_of
+from scanner.decode.strips import in_strips, threads_to_use
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, ProjectorSize
-from scanner.patterns.description import Axis
 
-SAMPLE = 30_000
-"""Pixels from which a capture's noise is judged."""
+SAMPLE = 4096
+"""Pixels from which a capture's noise is judged, times the coarse bits: its median is good to 2 %."""
+
+ENOUGH = 1024
+"""Pixels with light in them that a sample should have; larger ones are taken until it has, or there are no more."""
 
 
 @dataclass(frozen=True)
@@ -46,31 +51,28 @@ class GrayThresholds:
     """probability that every bit is right that matters"""
 
 
-@dataclass
-class _Images:
-    """Code images of one axis, of one kind: (bits, P), taken as they arrive."""
-
-    pixels: NDArray[Any]
-    have: set[int] = field(default_factory=set)
-
-    def take(self, bit: int, frame: NDArray[Any]) -> None:
-        """Keep a copy of the image of `bit`."""
-        self.pixels[bit] = frame.reshape(-1)
-        self.have.add(bit)
-
-
 @dataclass(frozen=True)
-class _Bits:
-    """One axis: its images and their inverses."""
+class _Codes:
+    """The frames by what they are, in the form kernels take them.
 
-    axis: Axis
-    plain: _Images
-    inverse: _Images
+    addresses: (A, bits, 2) intp, image and inverse, 0 where there is none. kinds: (A, bits) int64, PLAIN, INVERSE or
+    BOTH. levels: (2,) intp, white and black, or zeros. like: (0,) of the frames' dtype.
+    """
 
-    def kinds(self, bits: int) -> list[int | None]:
-        """PLAIN, INVERSE or BOTH for each bit; None where neither has come."""
-        table = {(True, True): BOTH, (True, False): PLAIN, (False, True): INVERSE}
-        return [table.get((bit in self.plain.have, bit in self.inverse.have)) for bit in range(bits)]
+    addresses: NDArray[np.intp]
+    kinds: NDArray[np.int64]
+    levels: NDArray[np.intp]
+    like: NDArray[Any]
+
+    @property
+    def has_levels(self) -> bool:
+        """Whether white and black were projected and came."""
+        return bool(self.levels.all())
+
+    @property
+    def coarse(self) -> int:
+        """Bits whose pairs stand in for white and black; the finest are left out: blur has taken their contrast."""
+        return int(max((self.kinds.shape[1] + 1) // 2, 1))
 
 
 class GrayDecoder:
@@ -80,13 +82,18 @@ class GrayDecoder:
         sequence: what was projected; its pattern is a `GrayPattern`.
         camera: the frames' format.
         thresholds: when a pixel is left undecided.
+        threads: that share the pass over the pixels; as `threads_to_use` says if None.
 
     Raises:
         DecodeError: neither inverses, nor white and black.
     """
 
     def __init__(
-        self, sequence: PatternSequence, camera: CameraFormat, thresholds: GrayThresholds | None = None
+        self,
+        sequence: PatternSequence,
+        camera: CameraFormat,
+        thresholds: GrayThresholds | None = None,
+        threads: int | None = None,
     ) -> None:
         if not isinstance(sequence.pattern, GrayPattern):
             raise DecodeError(f"a Gray code decoder cannot decode method {sequence.pattern.method!r}")
@@ -100,29 +107,35 @@ class GrayDecoder:
         self._camera = camera
         self._thresholds = thresholds or GrayThresholds()
         self._check = FrameCheck(sequence, camera)
-        self._axes = {
-            axis: _Bits(axis, self._images(True), self._images(self._pattern.inverse)) for axis in self._pattern.axes
-        }
-        self._where = {p: i for i, p in enumerate(sequence.fringes)}
-        self._levels: dict[str, NDArray[Any]] = {}
+        self._threads = threads or threads_to_use()
+        pattern = sequence.pattern
+        self._kept = {*sequence.fringes, *({sequence.white, sequence.black} - {None})}
+        self._frames: dict[int, NDArray[Any]] = {}
+        pixels = camera.width * camera.height
+        # Written now, while frames are being exposed: the system finds the memory before the last one has come.
+        self._maps = aligned_rows(2 * len(pattern.axes) + 3, -(-pixels // 16) * 16)
+        self._maps.fill(0)
+        self._reason = np.full(pixels, 0, np.uint8)
 
     def add(self, position: int, frame: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-        """Take the frame at `position`.
+        """Take a copy of the frame at `position`.
 
         Raises:
             DecodeError: wrong size or dtype, or a position that was given before or does not exist.
         """
         self._check.take(position, frame)
-        if position == self._sequence.white:
-            self._levels["white"] = frame.reshape(-1).copy()
-        elif position == self._sequence.black:
-            self._levels["black"] = frame.reshape(-1).copy()
-        elif position in self._where:
-            each = self._pattern.frames_per_bit
-            axis, within = divmod(self._where[position], self._pattern.bits * each)
-            bit, inverted = divmod(within, each)
-            bits = self._axes[self._pattern.axes[axis]]
-            (bits.inverse if inverted else bits.plain).take(bit, frame)
+        if position in self._kept:
+            self._frames[position] = frame.copy(order="C")
+
+    def keep(self, position: int, frame: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+        """Take the frame at `position` as it is, without a copy: it must not change before `finish` has returned.
+
+        Raises:
+            DecodeError: see `add`.
+        """
+        self._check.take(position, frame)
+        if position in self._kept:
+            self._frames[position] = np.ascontiguousarray(frame)
 
     def finish(self) -> Decoded:
         """The maps.
@@ -130,43 +143,43 @@ class GrayDecoder:
         Raises:
             DecodeError: a bit cannot be told; the missing frames are named.
         """
-        warnings = self._check_complete()
-        light, dark, clipped = self._light_and_dark()
-        factor = self._noise_factor(light, dark)
-        found = {axis: self._decode(bits, light, dark, clipped, factor) for axis, bits in self._axes.items()}
-        first, *rest = found.values()
-        for other in rest:
-            first.join(other)
-        return self._decoded(found, light, dark, factor, warnings)
-
-    def _images(self, projected: bool) -> _Images:
-        rows = self._pattern.bits if projected else 0
-        return _Images(np.empty((rows, self._camera.width * self._camera.height), self._camera.dtype))
+        codes = self._codes()
+        warnings = self._check_complete(codes)
+        factor = self._noise_factor(codes)
+        return self._decoded(self._decode(codes, factor), factor, warnings)
 
     # --- frames -------------------------------------------------------------------------------------------------
 
-    def _check_complete(self) -> tuple[str, ...]:
-        have_levels = len(self._levels) == 2
+    def _codes(self) -> _Codes:
+        pattern, sequence = self._pattern, self._sequence
+        each, bits = pattern.frames_per_bit, pattern.bits
+        addresses = np.zeros((len(pattern.axes), bits, 2), np.intp)
+        for index, position in enumerate(sequence.fringes):
+            if position in self._frames:
+                axis, within = divmod(index, bits * each)
+                bit, inverted = divmod(within, each)
+                addresses[axis, bit, inverted] = addresses_of([self._frames[position]])[0]
+        have = addresses != 0
+        kinds = np.where(have.all(axis=2), BOTH, np.where(have[:, :, 0], PLAIN, INVERSE))
+        levels = np.zeros(2, np.intp)
+        if sequence.white in self._frames and sequence.black in self._frames:
+            levels[:] = addresses_of([self._frames[p] for p in (sequence.white, sequence.black) if p is not None])
+        return _Codes(addresses, kinds, levels, np.empty(0, self._camera.dtype))
+
+    def _check_complete(self, codes: _Codes) -> tuple[str, ...]:
+        pattern, sequence = self._pattern, self._sequence
+        each, have = pattern.frames_per_bit, codes.addresses != 0
         lost, warnings = [], []
-        for index, (axis, bits) in enumerate(self._axes.items()):
-            each = self._pattern.frames_per_bit
-            for bit, kind in enumerate(bits.kinds(self._pattern.bits)):
-                first = (index * self._pattern.bits + bit) * each
-                frames = [self._sequence.fringes[first + n] for n in range(each)]
-                if kind is None or (kind != BOTH and not have_levels):
-                    lost += [
-                        p
-                        for p, images in zip(frames, (bits.plain, bits.inverse), strict=False)
-                        if bit not in images.have
-                    ]
-                elif kind != BOTH and each == 2:
+        for index, axis in enumerate(pattern.axes):
+            for bit in range(pattern.bits):
+                first = (index * pattern.bits + bit) * each
+                came = have[index, bit, :each]
+                if not came.any() or not ((came.all() and each == 2) or codes.has_levels):
+                    lost += [sequence.fringes[first + n] for n in range(each) if not came[n]]
+                elif not came.all():
                     warnings.append(f"bit {bit} along {axis} decoded from one of its two frames")
-        if not self._pattern.inverse and not have_levels:
-            lost += [
-                p
-                for p, name in ((self._sequence.white, "white"), (self._sequence.black, "black"))
-                if name not in self._levels and p is not None
-            ]
+        if not pattern.inverse and not codes.has_levels:
+            lost += [p for p in (sequence.white, sequence.black) if p is not None and p not in self._frames]
         if lost:
             raise DecodeError(
                 f"frames {', '.join(map(str, sorted(set(lost))))} are missing: the code cannot be read without them",
@@ -174,83 +187,91 @@ class GrayDecoder:
             )
         return tuple(warnings)
 
-    def _light_and_dark(self) -> tuple[Map, Map, NDArray[np.uint8]]:
-        # White and black as projected, or the brighter and darker of each pair, averaged: the finest bits are left
-        # out of the average where there are others, because blur has taken their contrast.
-        clip = max(int(np.ceil(self._thresholds.saturation * self._camera.max_value)), 1)
-        if len(self._levels) == 2:
-            light, dark = (self._levels[name].astype(np.float32) for name in ("white", "black"))
-            return light, dark, np.asarray(dark >= clip, dtype=np.uint8)
-        coarse = max((self._pattern.bits + 1) // 2, 1)
-        pairs = [(b.plain.pixels[bit], b.inverse.pixels[bit]) for b in self._axes.values() for bit in range(coarse)]
-        light = np.mean([np.maximum(a, b) for a, b in pairs], axis=0, dtype=np.float32)
-        dark = np.mean([np.minimum(a, b) for a, b in pairs], axis=0, dtype=np.float32)
-        return light, dark, np.asarray(dark >= clip - 0.5, dtype=np.uint8)
+    def _noise_factor(self, codes: _Codes) -> float:
+        """Variance over that of the default model, from what the images of a pixel have in common.
 
-    def _noise_factor(self, light: Map, dark: Map) -> float:
-        # Variance over that of the default model, from what the images of a pixel have in common: an image and its
-        # inverse add up to the same in all bits; without inverses an image is as light as white or as dark as black.
-        model = default_noise(self._camera.max_value)
-        stride = max(light.size // SAMPLE, 1) | 1
-        white, black = light[::stride], dark[::stride]
-        lit = (white - black > self._thresholds.min_contrast_levels) & (white < self._camera.max_value)
+        An image and its inverse add up to the same in all bits; without inverses an image is as light as white or as
+        dark as black.
+        """
+        model, max_value = default_noise(self._camera.max_value), self._camera.max_value
+        pixels, size = self._reason.size, SAMPLE
+        while True:
+            image, inverse, white, black = self._sample(codes, size)
+            lit = (white - black > self._thresholds.min_contrast_levels) & (white < max_value)
+            if np.count_nonzero(lit) >= ENOUGH or size >= pixels:
+                break
+            size *= 8
         if np.count_nonzero(lit) < 100:
             return 1.0
-        expected = model.variance((white + black) * np.float32(0.5))[lit]
-        ratios = []
-        for bits in self._axes.values():
-            for bit, kind in enumerate(bits.kinds(self._pattern.bits)):
-                if kind == BOTH:
-                    image, inverse = (i.pixels[bit, ::stride][lit] for i in (bits.plain, bits.inverse))
-                    total = image.astype(np.float32) + inverse
-                    ratios.append((total - white[lit] - black[lit]) ** 2 / ((4 if self._levels else 3) * expected))
-                else:
-                    images = bits.plain if kind == PLAIN else bits.inverse
-                    image = images.pixels[bit, ::stride][lit].astype(np.float32)
-                    nearer = np.minimum(np.abs(image - white[lit]), np.abs(image - black[lit]))
-                    ratios.append(nearer**2 / (2 * expected))
-        # Coarse bits have few borders of cells in them; those are cut off at three sigmas, which leaves .973 of the
-        # mean square. (.455 is the median square: whole grey levels make it too coarse to be the measure itself.)
-        coarse = np.concatenate(ratios[: max(len(ratios) // 2, 1)])
+        image, inverse, white, black = image[:, lit], inverse[:, lit], white[lit], black[lit]
+        expected = model.variance((white + black) * np.float32(0.5))
+        # The first axis's coarse bits: they have few borders of cells in them.
+        kinds = codes.kinds[0, : codes.coarse, None]
+        pairs = (image + inverse - white - black) ** 2 / ((4 if codes.has_levels else 3) * expected)
+        one = np.where(kinds == INVERSE, inverse, image)
+        single = np.minimum(np.abs(one - white), np.abs(one - black)) ** 2 / (2 * expected)
+        ratios = np.where(kinds == BOTH, pairs, single).reshape(-1)
+        # Borders are cut off at three sigmas, which leaves .973 of the mean square. (.455 is the median square: whole
+        # grey levels make it too coarse to be the measure itself.)
         least = float(np.median(ROUNDING_VARIANCE / expected))
-        within = coarse <= 9 * max(float(np.median(coarse)) / 0.455, least)
-        return max(float(coarse[within].mean()) / 0.973, least)
+        within = ratios <= 9 * max(float(np.median(ratios)) / 0.455, least)
+        return max(float(ratios[within].mean()) / 0.973, least)
+
+    def _sample(self, codes: _Codes, size: int) -> tuple[Map, Map, Map, Map]:
+        """Coarse images of the first axis and their inverses, (bits, n) float32, white and black, (n,)."""
+        starts, length = runs_of(self._reason.size, size)
+        wanted = codes.addresses[:1, : codes.coarse].transpose(2, 0, 1).reshape(2, -1)
+        table = np.concatenate([wanted.reshape(-1), codes.levels])
+        found = np.zeros((table.size, starts.size * length), self._camera.dtype)
+        here = np.flatnonzero(table)
+        taken = np.empty((here.size, found.shape[1]), self._camera.dtype)
+        gather(table[here], codes.like, starts, length, taken)
+        found[here] = taken
+        grey = found.astype(np.float32)
+        image, inverse = grey[: wanted.shape[1]], grey[wanted.shape[1] : -2]
+        if codes.has_levels:
+            return image, inverse, grey[-2], grey[-1]
+        return image, inverse, np.maximum(image, inverse).mean(axis=0), np.minimum(image, inverse).mean(axis=0)
 
     # --- decoding -----------------------------------------------------------------------------------------------
 
-    def _decode(self, bits: _Bits, light: Map, dark: Map, clipped: NDArray[np.uint8], factor: float) -> _AxisMaps:
-        pattern, t = self._pattern, self._thresholds
-        kinds = [kind for kind in bits.kinds(pattern.bits) if kind is not None]
-        model = default_noise(self._camera.max_value)
-        maps = _AxisMaps.empty(light.size)
-        decode_bits(
-            bits.plain.pixels, (bits.inverse if pattern.inverse else bits.plain).pixels, np.array(kinds),
-            light, dark, clipped,
-            pattern.code == "gray", pattern.code_bits - pattern.bits, self._sequence.projector.along(bits.axis),
+    def _decode(self, codes: _Codes, factor: float) -> NDArray[np.int64]:
+        """Fill the maps; how many pixels have each reason."""
+        pattern, t, axes = self._pattern, self._thresholds, len(self._pattern.axes)
+        max_value = self._camera.max_value
+        model = default_noise(max_value)
+        maps = self._maps[:, : self._reason.size]
+        arguments = (
+            codes.addresses, codes.kinds, codes.levels, codes.like, codes.coarse,
+            max(int(np.ceil(t.saturation * max_value)), 1), pattern.code == "gray", pattern.code_bits - pattern.bits,
+            np.array([self._sequence.projector.along(axis) for axis in pattern.axes]),
             np.array([model.read, model.per_level, ROUNDING_VARIANCE, factor], np.float32),
             np.array([t.min_contrast_levels, t.min_contrast_sigmas**2, t.decisive_share, t.decisive_sigmas**2,
-                      1 - t.min_code_probability, t.max_open_cells], np.float32),
-            maps.position, maps.sigma, maps.confidence, maps.reason,
+                      1 - t.min_code_probability, t.max_open_cells, max_value], np.float32),
         )  # fmt: skip
-        return maps
+        out = maps[:axes], maps[axes : 2 * axes], maps[2 * axes], maps[2 * axes + 1], maps[2 * axes + 2], self._reason
 
-    def _decoded(
-        self, found: Mapping[Axis, _AxisMaps], light: Map, dark: Map, factor: float, warnings: tuple[str, ...]
-    ) -> Decoded:
-        shape = self._camera.shape
-        merged = next(iter(found.values()))
-        positions = {axis: maps.position.reshape(shape) for axis, maps in found.items()}
-        sigmas = {axis: maps.sigma.reshape(shape) for axis, maps in found.items()}
-        counts = np.bincount(merged.reason, minlength=len(Reason))
+        def decode(begin: int, end: int) -> NDArray[np.int64]:
+            counts = np.zeros(REASONS, np.int64)
+            decode_codes(*arguments, begin, end, *out, counts)
+            return counts
+
+        return np.asarray(np.sum(in_strips(decode, self._reason.size, self._threads), axis=0))
+
+    def _decoded(self, counts: NDArray[np.int64], factor: float, warnings: tuple[str, ...]) -> Decoded:
+        shape, axes = self._camera.shape, self._pattern.axes
+        maps = [row[: self._reason.size].reshape(shape) for row in self._maps]
+        positions, sigmas = dict(zip(axes, maps, strict=False)), dict(zip(axes, maps[len(axes) :], strict=False))
+        confidence, albedo, modulation = maps[2 * len(axes) :]
         return Decoded(
             rows=positions.get("y"),
             columns=positions.get("x"),
             sigma_rows=sigmas.get("y"),
             sigma_columns=sigmas.get("x"),
-            confidence=merged.confidence.reshape(shape),
-            albedo=((light + dark) * np.float32(0.5)).reshape(shape),
-            modulation=((light - dark) * np.float32(0.5)).reshape(shape),
-            reason=merged.reason.reshape(shape),
+            confidence=confidence,
+            albedo=albedo,
+            modulation=modulation,
+            reason=self._reason.reshape(shape),
             warnings=warnings,
             details={
                 "method": "gray",
@@ -259,30 +280,6 @@ class GrayDecoder:
                 "noise_factor": factor,
             },
         )
-
-
-@dataclass(frozen=True)
-class _AxisMaps:
-    """(P,) maps of one axis."""
-
-    position: Map
-    sigma: Map
-    confidence: Map
-    reason: NDArray[np.uint8]
-
-    @classmethod
-    def empty(cls, pixels: int) -> _AxisMaps:
-        """Maps to be written."""
-        position, sigma, confidence = (np.empty(pixels, np.float32) for _ in range(3))
-        return cls(position, sigma, confidence, np.empty(pixels, np.uint8))
-
-    def join(self, other: _AxisMaps) -> None:
-        """Keep what both axes decided; this axis's confidence and reason become those of both."""
-        np.multiply(self.confidence, other.confidence, out=self.confidence)
-        self.reason[self.reason == 0] = other.reason[self.reason == 0]
-        undecided = self.reason != 0
-        for values in (self.position, self.sigma, other.position, other.sigma):
-            values[undecided] = np.nan
 
 
 def warm_up() -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,13 +19,11 @@ from scanner.decode.agreement import disagreements
 from scanner.decode.frames import FrameCheck
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis
 from scanner.decode.pmp_frames import axis_frames
+from scanner.decode.strips import threads_to_use
 from scanner.decode.unwrapping import plan_ladder
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
 from scanner.patterns.description import Axis
-
-MAX_THREADS = 4
-"""More do not read memory faster."""
 
 
 class PmpDecoder:
@@ -36,7 +33,7 @@ class PmpDecoder:
         sequence: what was projected; its pattern is a `PmpPattern`.
         camera: the frames' format.
         thresholds: when a pixel is left undecided.
-        threads: that share the pass over the pixels; as many as Numba may use, up to MAX_THREADS, if None.
+        threads: that share the pass over the pixels; as `threads_to_use` says if None.
 
     Raises:
         DecodeError: the frequencies are ambiguous over the projector.
@@ -55,7 +52,7 @@ class PmpDecoder:
         self._pattern = sequence.pattern
         self._camera = camera
         self._thresholds = thresholds or PmpThresholds()
-        self._threads = threads or min(numba.get_num_threads(), MAX_THREADS)
+        self._threads = threads or threads_to_use()
         plan_ladder(self._pattern.frequencies, [2 / n for n in self._pattern.shifts])
         self._check = FrameCheck(sequence, camera)
         self._fringe_at = {position: fringe for fringe, position in enumerate(sequence.fringes)}

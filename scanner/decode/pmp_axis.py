@@ -6,28 +6,25 @@ kernels leave the interpreter lock alone. Both axes of a scan are decoded apart 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Map, Reason
+from scanner.decode.addresses import aligned_rows
 from scanner.decode.agreement import Remainder
 from scanner.decode.neighbours import settle
 from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel
 from scanner.decode.pmp_frames import AxisFrames
-from scanner.decode.pmp_kernels import REASONS, TILE, decode_pixels, join_maps
+from scanner.decode.pmp_kernels import decode_pixels, join_maps
 from scanner.decode.pmp_sample import PRIOR_FREEDOM, take_sample
+from scanner.decode.reasons import REASONS
+from scanner.decode.strips import in_strips
 from scanner.decode.unwrapping import Ladder, plan_ladder
 from scanner.patterns import CameraFormat
 from scanner.patterns.pmp import PmpPattern
-
-STRIPS = 6
-"""Strips of the image for each thread: few enough to cost nothing, enough to even out a thread that is held up."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +72,11 @@ class AxisMaps:
     @classmethod
     def empty(cls, pixels: int) -> AxisMaps:
         """Maps to be written."""
-        # np.full writes, np.empty only promises: the system finds the memory now, while frames are being exposed, and
+        # Written now: the system finds the memory now, while frames are being exposed, and
         # not after the last one.
-        # One block of all maps, rows apart by whole cache lines: large enough for the system's large pages.
-        block = np.full((5, -(-pixels // 16) * 16), 0, np.float32)
+        # One block of all maps: large enough for the system's large pages; and aligned, as vector stores like it.
+        block = aligned_rows(5, -(-pixels // 16) * 16)
+        block.fill(0)
         position, sigma, confidence, albedo, modulation = (row[:pixels] for row in block)
         return cls(position, sigma, confidence, albedo, modulation, np.full(pixels, 0, np.uint8))
 
@@ -136,7 +134,7 @@ def decode_axis(
     errors2 = ladder.errors**2
     systematic = np.array([r.systematic for r in remainders], dtype=np.float64)
     arguments = (
-        frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, t.clip(camera),
+        frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, frames.whole, t.clip(camera),
         f32(frames.gains), f32(ladder.combinations), f32(ladder.ratios),
         f32(errors2), f32(errors2.sum(axis=1) * systematic**2),
         f32([noise.read, noise.per_level, ROUNDING_VARIANCE, PRIOR_FREEDOM, 1 / (PRIOR_FREEDOM + frames.freedom)]),
@@ -166,19 +164,3 @@ def finest_of(pattern: PmpPattern) -> int:
     """Index of the finest set."""
     f = pattern.frequencies
     return max(range(len(f)), key=lambda k: (f[k], k))
-
-
-def in_strips(work: Callable[[int, int], Any], pixels: int, threads: int) -> list[Any]:
-    """What `work(begin, end)` returns for strips that make up all pixels, shared among threads; in no order."""
-    if threads == 1 or pixels <= TILE:
-        return [work(0, pixels)]
-    length = -(-pixels // (threads * STRIPS * TILE)) * TILE
-    # The iterator is shared: its next strip goes to whoever asks first.
-    begins = iter(range(0, pixels, length))
-
-    def share() -> list[Any]:
-        return [work(begin, min(begin + length, pixels)) for begin in begins]
-
-    with ThreadPoolExecutor(threads - 1) as pool:
-        others = [pool.submit(share) for _ in range(threads - 1)]
-        return share() + [result for other in others for result in other.result()]

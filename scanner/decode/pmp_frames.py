@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode.addresses import addresses_of
-from scanner.decode.pmp_kernels import GROUP
+from scanner.decode.pmp_sums import GROUP
 from scanner.patterns import PmpPattern
 from scanner.patterns.description import Axis
 
@@ -23,7 +23,8 @@ class AxisFrames:
     """The frames of one axis, by sets; F counts each set's up to a multiple of GROUP.
 
     frames: kept while addresses are in use. addresses: (F,) intp. starts: (K + 1,) intp, where sets begin.
-    weights: (3, F) float32 of A, p and q. grams: (K, 6) float32 of the normal matrices. gains: (K,) variance of (p, q)
+    weights: (3, F) float32 of A, p and q. grams: (K, 6) float32 of the normal matrices. whole: (K,) shifts of sets
+    that have all of their 4 or 8, or 0. gains: (K,) variance of (p, q)
     over that of one sample. freedom: degrees of freedom of all sets' residuals.
     """
 
@@ -32,6 +33,7 @@ class AxisFrames:
     starts: NDArray[np.intp]
     weights: NDArray[np.float32]
     grams: NDArray[np.float32]
+    whole: NDArray[np.intp]
     gains: tuple[float, ...]
     freedom: int
 
@@ -48,7 +50,7 @@ def axis_frames(pattern: PmpPattern, axis: Axis, by_fringe: Mapping[int, NDArray
         by_fringe: frames without gaps in memory, by fringe index.
     """
     frames: list[NDArray[Any]] = []
-    starts, weights, grams, gains, freedom = [0], [], [], [], 0
+    starts, weights, grams, whole, gains, freedom = [0], [], [], [], [], 0
     for fringe_set in pattern.sets():
         if fringe_set.axis != axis:
             continue
@@ -59,6 +61,7 @@ def axis_frames(pattern: PmpPattern, axis: Axis, by_fringe: Mapping[int, NDArray
         padding = -len(have) % GROUP
         weights.append(np.pad(inverse @ design.T, ((0, 0), (0, padding))))
         grams.append([gram[0, 0], gram[1, 1], gram[2, 2], 2 * gram[0, 1], 2 * gram[0, 2], 2 * gram[1, 2]])
+        whole.append(fringe_set.shifts if fringe_set.shifts == len(have) in (4, 8) else 0)
         gains.append(round(float(inverse[1, 1] + inverse[2, 2]) / 2, 9))
         freedom += len(have) - 3
         frames += [by_fringe[fringe_set.first + n] for n in have + have[:1] * padding]
@@ -69,6 +72,7 @@ def axis_frames(pattern: PmpPattern, axis: Axis, by_fringe: Mapping[int, NDArray
         np.array(starts, np.intp),
         np.concatenate(weights, axis=1).astype(np.float32),
         np.array(grams, np.float32),
+        np.array(whole, np.intp),
         tuple(gains),
         freedom,
     )

@@ -15,20 +15,17 @@ from numpy.typing import NDArray
 from scanner.decode.agreement import PAIR_DISTANCE, Remainder, agreement, noise_of_pairs
 from scanner.decode.noise import NoiseModel, default_noise, fit_noise
 from scanner.decode.pmp_frames import AxisFrames
-from scanner.decode.pmp_kernels import fit_runs
+from scanner.decode.pmp_sums import fit_runs
+from scanner.decode.runs import runs_of
 from scanner.decode.unwrapping import Ladder
 
 SIZE = 4096
 """Pixels of a first sample: the median of a twelfth of it is good to 5 %, its noise model to 2 %."""
 
-RUN = 64
-"""Pixels side by side: a cache line of each 8-bit frame."""
-
 ENOUGH = 1024
 """Pixels with light in them that a sample should have; larger ones are taken until it has, or there are no more."""
 
 _GROWTH = 8
-_GOLDEN = (5**0.5 - 1) / 2
 PRIOR_FREEDOM = 8.0
 """Weight of the scan's noise model against a pixel's own residual, in degrees of freedom (conjugate prior)."""
 
@@ -101,22 +98,11 @@ def take_sample(frames: AxisFrames, pixels: int, max_value: int, clip: int, leas
     """
     size = SIZE
     while True:
-        sample = _fit(frames, _runs(pixels, size), min(RUN, pixels), max_value, clip)
+        sample = _fit(frames, *runs_of(pixels, size), max_value, clip)
         lit = np.count_nonzero((sample.modulations > least).all(axis=0) & sample.usable)
         if lit >= ENOUGH or size >= pixels:
             return sample
         size *= _GROWTH
-
-
-def _runs(pixels: int, size: int) -> NDArray[np.intp]:
-    """(R,) first pixels of runs, one in each of R equal parts of the image, at places that fall into no step with its
-    width; all of a small image."""
-    length = min(RUN, pixels)
-    if size * 2 >= pixels:
-        return np.arange(0, pixels - length + 1, length, dtype=np.intp)
-    count = size // length
-    within = np.arange(count) * _GOLDEN % 1
-    return ((np.arange(count) + within) * ((pixels - length) / count)).astype(np.intp)
 
 
 def _fit(frames: AxisFrames, runs: NDArray[np.intp], length: int, max_value: int, clip: int) -> Sample:
@@ -125,7 +111,7 @@ def _fit(frames: AxisFrames, runs: NDArray[np.intp], length: int, max_value: int
     mean, residual = (np.empty(runs.size * length, np.float32) for _ in range(2))
     clipped = np.empty(runs.size * length, np.bool_)
     fit_runs(
-        frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, clip, runs, length,
+        frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, frames.whole, clip, runs, length,
         phases, modulations, mean, residual, clipped,
     )  # fmt: skip
     return Sample(

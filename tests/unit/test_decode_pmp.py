@@ -11,8 +11,8 @@ import pytest
 from scanner.decode import Reason, decoder_for
 from scanner.decode.neighbours import CONFIDENCE, settle
 from scanner.decode.pmp import PmpDecoder, PmpThresholds, warm_up
-from scanner.decode.pmp_axis import in_strips
-from scanner.decode.pmp_kernels import ARCTAN_ERROR_CYCLES, TILE, _phase
+from scanner.decode.pmp_sums import ARCTAN_ERROR_CYCLES, TILE, _measure, _turn
+from scanner.decode.strips import in_strips
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, PmpPattern, ProjectorSize
 
@@ -469,14 +469,7 @@ def test_the_arctangent_is_as_good_as_it_says():
 
 def turns_of(p, q):
     """The kernel's arctangent at given sums."""
-    sums = np.zeros(5 * TILE, np.float32)
-    gram = np.array([3, 1.5, 1.5, 0, 0, 0], np.float32)
-    out = [np.zeros(TILE, np.float32) for _ in range(5)]
-    found = []
-    for at in range(0, p.size, TILE):
-        size = min(TILE, p.size - at)
-        sums[2 * TILE : 2 * TILE + size] = p[at : at + size]
-        sums[3 * TILE : 3 * TILE + size] = q[at : at + size]
-        _phase(sums, gram, size, *out)
-        found.append(out[0][:size].copy())
-    return np.concatenate(found)
+    out = [np.zeros(p.size, np.float32) for _ in range(3)]
+    _measure(p, q, p.size, *out)
+    _turn(p, q, p.size, out[0])
+    return out[0]

@@ -1,0 +1,30 @@
+"""How many pixels have each reason for having no value, counted while they are in the cache."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.kernel import contracting_kernel
+
+REASONS = 9
+"""Members of `scanner.decode.Reason`."""
+
+
+@contracting_kernel
+def count_reasons(reason: NDArray[np.uint8], counts: NDArray[np.int64]) -> None:
+    """Add to counts, (REASONS,), how many of up to 65,535 pixels have each reason."""
+    values = _how_many(reason, 0)
+    counts[0] += values
+    if values < reason.size:
+        for why in range(1, REASONS):
+            counts[why] += _how_many(reason, why)
+
+
+@contracting_kernel
+def _how_many(reason: NDArray[np.uint8], why: int) -> int:
+    # A tile's worth fits 16 bits; narrow counters are what makes this a few vector instructions.
+    found, wanted = np.uint16(0), np.uint8(why)
+    for i in range(reason.size):
+        found = np.uint16(found + np.uint16(reason[i] == wanted))
+    return int(found)
