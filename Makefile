@@ -22,7 +22,8 @@ test: setup ## all tests; ARGS="-k config" and the like are passed on
 	@setup/firmware-tools.sh
 	@$(bin)/python -m pytest -q $(ARGS)
 
-rig: setup ## the drivers against the kernel's virtual devices, in a guest under QEMU
+rig: ## the drivers against the kernel's virtual devices, in a guest under QEMU
+	@setup/install.sh --no-kernels
 	@setup/rig.sh
 
 check: ## format, lint, types, layers

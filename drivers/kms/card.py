@@ -90,7 +90,7 @@ def find(device: str) -> tuple[Node, Output]:
         DeviceNotFound: no such output, or nothing is connected to it; the hint lists what there is.
         PermissionDenied: the card may not be opened.
     """
-    card, wanted = _split(device)
+    card, wanted = split(device)
     seen: list[str] = []
     refused: DeviceError | None = None
     for path in [card] if card else cards():
@@ -206,8 +206,8 @@ def mode_info(mode: Mode) -> drm.ModeInfo:
     return drm.ModeInfo.from_buffer_copy(mode.info)
 
 
-def _split(device: str) -> tuple[str, str]:
-    """Card's path and output's name, either may be ""."""
+def split(device: str) -> tuple[str, str]:
+    """Card's path and output's name of a device string; either may be ""."""
     if not device.startswith("/"):
         card, _, name = device.rpartition("/")
         if not card and (CARDS / name).exists() and name:
@@ -224,13 +224,13 @@ def _output(node: Node, connector: int) -> Output | None:
     node.call(drm.GETCONNECTOR, said)
     if said.connector_type == drm.CONNECTOR_WRITEBACK:
         return None
-    modes, encoders = (drm.ModeInfo * said.count_modes)(), (ctypes.c_uint32 * said.count_encoders)()
+    listed, encoders = (drm.ModeInfo * said.count_modes)(), (ctypes.c_uint32 * said.count_encoders)()
     if said.count_modes:  # with no room for modes the kernel would probe the cable a second time
         again = drm.Connector(
             connector_id=connector,
-            modes_ptr=ctypes.addressof(modes),
+            modes_ptr=ctypes.addressof(listed),
             encoders_ptr=ctypes.addressof(encoders),
-            count_modes=len(modes),
+            count_modes=len(listed),
             count_encoders=len(encoders),
         )
         node.call(drm.GETCONNECTOR, again)
@@ -241,12 +241,13 @@ def _output(node: Node, connector: int) -> Output | None:
         name=f"{kind}-{said.connector_type_id}",
         connector=connector,
         connected=said.connection == drm.CONNECTED,
-        modes=tuple(_modes(modes)),
+        modes=tuple(modes(listed)),
         encoders=tuple(encoders),
     )
 
 
-def _modes(listed: ctypes.Array[drm.ModeInfo]) -> Iterator[Mode]:
+def modes(listed: ctypes.Array[drm.ModeInfo]) -> Iterator[Mode]:
+    """The kernel's list of modes, without those that do not show what was loaded."""
     for info in listed:
         total = info.htotal * info.vtotal
         if not total or info.flags & (drm.MODE_FLAG_INTERLACE | _DOUBLE_SCAN):

@@ -58,7 +58,7 @@ class KmsProjector:
         self._counted = 0
         self._counts_blanks = True
         try:
-            self._mode = _mode(output, options.mode, self._name)
+            self._mode = choose_mode(output, options.mode, self._name)
             take_master(node)
             _require(node, drm.CAP_DUMB_BUFFER, "images in plain memory", self._name)
             _require(node, drm.CAP_TIMESTAMP_MONOTONIC, "stamps on CLOCK_MONOTONIC", self._name)
@@ -267,7 +267,13 @@ class KmsProjector:
             raise DeviceError("the projector is closed", device=self._name)
 
 
-def _mode(output: Output, wanted: str | None, device: str) -> Mode:
+def choose_mode(output: Output, wanted: str | None, device: str) -> Mode:
+    """The mode that a rig file's string means; None: the display's own.
+
+    Raises:
+        ConfigError: the display has no such mode; the hint lists those it has.
+        DeviceError: it has none at all.
+    """
     if wanted is None:
         native = output.native
         if native is None:

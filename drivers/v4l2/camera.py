@@ -10,9 +10,8 @@ host and calls it the start of exposure. So stamps are `estimated` until the rig
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from drivers.v4l2 import controls, formats, timings
+from drivers.v4l2 import controls, exposure, formats, timings
+from drivers.v4l2.exposure import Stamping
 from drivers.v4l2.node import VideoNode, open_node
 from drivers.v4l2.options import CameraOptions
 from drivers.v4l2.queue import SLICE_MS, BufferQueue, Dequeued
@@ -21,25 +20,9 @@ from scanner.devices import (
     CameraCapabilities,
     CameraFrame,
     CameraSettings,
-    Exposure,
-    Source,
     TriggerMode,
 )
 from scanner.errors import ConfigError, DeviceBusy, DeviceError
-
-STAMP_ROUNDING_NS = 1000
-"""Stamps of v4l2_buffer are whole microseconds, cut off"""
-
-EXPOSURE_UNIT_NS = 100_000
-"""V4L2_CID_EXPOSURE_ABSOLUTE counts in 100 us"""
-
-
-@dataclass(frozen=True)
-class _ExposureControl:
-    """How the exposure is set; None where it cannot be."""
-
-    control: controls.Control
-    unit_ns: int
 
 
 class V4l2Camera:
@@ -94,20 +77,20 @@ class V4l2Camera:
     def capabilities(self) -> CameraCapabilities:
         """What it can do with the settings last applied."""
         low, high, step = self._exposure_bounds()
-        measured = self._options.stamp_delay_us is not None
+        stamping = self._stamping
         return CameraCapabilities(
             width=self._format.width,
             height=self._format.height,
             bits=self._capture.bits,
             shutter=self._options.shutter,
-            readout_ns=self._readout_ns,
+            readout_ns=stamping.readout_ns,
             exposure_min_ns=low,
             exposure_max_ns=high,
             exposure_step_ns=step,
             min_gap_ns=max(0, self._period_ns - self._exposure_ns),
             trigger_modes=frozenset({TriggerMode.FREE}),
-            stamp=Source.DRIVER if measured else Source.ESTIMATED,
-            stamp_bound_ns=self._bound_ns,
+            stamp=stamping.source,
+            stamp_bound_ns=stamping.bound_ns,
         )
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
@@ -187,7 +170,7 @@ class V4l2Camera:
         self._set_format(options.pixel_format)
         for name, value in options.controls.items():
             controls.write_named(self._node, name, value)
-        self._exposure_control = self._find_exposure()
+        self._exposure_control = exposure.find(self._node, options.exposure_unit_us)
         self._exposure_ns = self._read_exposure()
 
     def _set_format(self, wanted: str | None) -> None:
@@ -232,33 +215,17 @@ class V4l2Camera:
                 else "this camera has no exposure control",
             )
 
-    def _find_exposure(self) -> _ExposureControl | None:
-        by_id = {control.id: control for control in controls.controls(self._node).values()}
-        unit_us = self._options.exposure_unit_us
-        absolute, driver_own = by_id.get(controls.EXPOSURE_ABSOLUTE), by_id.get(controls.EXPOSURE)
-        if absolute is not None and absolute.settable:
-            return _ExposureControl(absolute, round(1e3 * unit_us) if unit_us else EXPOSURE_UNIT_NS)
-        if driver_own is not None and driver_own.settable and unit_us:
-            return _ExposureControl(driver_own, round(1e3 * unit_us))
-        return None
-
     def _exposure_bounds(self) -> tuple[int, int, int]:
-        """Shortest, longest and step, ns. No longer than a period: what is beyond it, the camera cuts off."""
-        means = self._exposure_control
-        if means is None:
+        """Shortest, longest and step, ns."""
+        if self._exposure_control is None:
             return self._exposure_ns, self._exposure_ns, 1000
-        step = max(means.control.step, 1) * means.unit_ns
-        low = max(means.control.minimum * means.unit_ns, step)
-        longest = min(means.control.maximum * means.unit_ns, self._period_ns)
-        return low, max(low, low + (longest - low) // step * step), step
+        return self._exposure_control.bounds(self._period_ns)
 
     def _set_exposure(self, exposure_ns: int) -> int:
         means = self._exposure_control
         if means is None:
             return self._exposure_ns
-        step = max(means.control.step, 1)
-        units = means.control.minimum + (exposure_ns // means.unit_ns - means.control.minimum) // step * step
-        return controls.write(self._node, means.control, max(units, means.control.minimum)) * means.unit_ns
+        return controls.write(self._node, means.control, means.units(exposure_ns)) * means.unit_ns
 
     def _read_exposure(self) -> int:
         means = self._exposure_control
@@ -266,50 +233,27 @@ class V4l2Camera:
             given = self._options.exposure_us
             return self._period_ns if given is None else round(1e3 * given)
         now = controls.read(self._node, means.control) * means.unit_ns
-        low, high, _ = self._exposure_bounds()
+        low, high, _ = means.bounds(self._period_ns)
         return now if low <= now <= high else self._set_exposure(min(max(now, low), high))
 
     @property
-    def _readout_ns(self) -> int:
-        given = self._options.readout_us
-        return self._period_ns if given is None else round(1e3 * given)
-
-    @property
-    def _bound_ns(self) -> int:
-        """What every stamp keeps: half the measured delay's spread, or without one two periods, a belief."""
-        measured = self._options.stamp_delay_us
-        if measured is None:
-            return 2 * self._period_ns
-        return round(500 * (measured[1] - measured[0])) + STAMP_ROUNDING_NS
+    def _stamping(self) -> Stamping:
+        readout_us = self._options.readout_us
+        return Stamping(
+            exposure_ns=self._exposure_ns,
+            readout_ns=self._period_ns if readout_us is None else round(1e3 * readout_us),
+            period_ns=self._period_ns,
+            rolling=self._options.shutter == "rolling",
+            delay_us=self._options.stamp_delay_us,
+        )
 
     def _frame(self, taken: Dequeued, queue: BufferQueue) -> CameraFrame:
         pixels = self._capture.unpack(queue.views[taken.index][: taken.bytes_used], self._format)
         complete = pixels is not None and not taken.damaged
         if pixels is None:
             pixels = self._capture.black(self._format)
-        return CameraFrame(pixels, taken.sequence, self._exposure(taken), complete)
-
-    def _exposure(self, taken: Dequeued) -> Exposure:
-        rolling = self._options.shutter == "rolling"
-        length = self._exposure_ns + (self._readout_ns if rolling else 0)
-        now = self._clock.now_ns()
-        # Clocks differ by seconds and more; drivers round by frames: vivid's stamps lie up to 1.4 periods ahead.
-        slack = 2 * self._period_ns
-        believable = taken.monotonic and self._begun_ns - slack <= taken.t_ns <= now + slack
-        measured = self._options.stamp_delay_us
-        if measured is not None:
-            if not believable:
-                raise DeviceError(
-                    "the driver's time stamps are not of CLOCK_MONOTONIC",
-                    device=self._name,
-                    hint="take stamp_delay_us out of the rig file: without good stamps it means nothing",
-                )
-            start = taken.t_ns - round(500 * (measured[0] + measured[1]))
-            return Exposure(start, start + length, self._bound_ns, Source.DRIVER)
-        if not believable:
-            return Exposure(now - length, now, self._bound_ns, Source.ESTIMATED)
-        start = taken.t_ns if taken.start_of_exposure else taken.t_ns - self._exposure_ns - self._readout_ns
-        return Exposure(start, start + length, self._bound_ns, Source.ESTIMATED)
+        exposed = self._stamping.exposure(taken, self._begun_ns, self._clock.now_ns(), self._name)
+        return CameraFrame(pixels, taken.sequence, exposed, complete)
 
     def _require_queue(self) -> BufferQueue:
         if self._queue is None:
