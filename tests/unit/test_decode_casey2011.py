@@ -447,6 +447,22 @@ def test_what_is_not_the_pattern_described_is_refused(board):
             decode_image(image, pattern, sequence.projector, camera)
 
 
+@pytest.mark.parametrize("count", [3, 7, 15, 31])
+def test_shuffled_orders_leave_little_in_order(count):
+    symbols = np.random.default_rng(1).permutation(np.arange(1, count + 1)).astype(np.int32)
+    orders = refusals.shuffled_orders(symbols)
+    assert (orders[0] == symbols[::-1]).all()
+    assert len(orders) == (1 if count == 3 else refusals.SHUFFLES)
+    place = {int(s): k for k, s in enumerate(symbols)}
+    for order in orders:
+        assert sorted(order) == sorted(symbols)
+        at = [place[int(s)] for s in order]
+        rises = [1] * count
+        for k in range(count):
+            rises[k] = 1 + max((rises[j] for j in range(k) if at[j] < at[k]), default=0)
+        assert max(rises) == refusals.longest_rise(np.array(at)) <= max(1, count // 3)
+
+
 def test_the_described_order_has_to_fit_better_than_shuffled_ones():
     symbols = np.arange(1, 16, dtype=np.int32)
     rates = np.full(4, 0.159), np.full(4, 0.2)

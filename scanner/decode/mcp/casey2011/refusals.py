@@ -6,6 +6,7 @@ known to hold the pattern.
 
 from __future__ import annotations
 
+import bisect
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,9 @@ five code words only); the reference scenes' own fit .34 and more, a rig of stro
 
 SHUFFLES = 8
 EVERY = 8
-"""Orders tried against the described one, on every so many columns: a hundred and more of them."""
+TRIES = 300
+"""Orders tried against the described one, on every so many columns (a hundred and more of them); and
+random orders looked at to find them."""
 
 
 def refuse_flat(image: NDArray[Any], camera: CameraFormat) -> None:
@@ -109,6 +112,32 @@ def refuse_order(agreement: float, word: Labels, peaks: stripe_detection.Peaks, 
     return chance
 
 
+def shuffled_orders(symbols: Labels) -> list[Labels]:
+    """The reversed order and up to SHUFFLES - 1 random ones that leave no more than a third of the symbols in order.
+
+    A column that shows only symbols in order fits any order that leaves them so; of few symbols most orders do.
+    """
+    generator = np.random.default_rng(2011)
+    orders = [symbols[::-1].copy()]
+    for _ in range(TRIES):
+        places = generator.permutation(len(symbols))
+        little = longest_rise(places) <= max(1, len(symbols) // 3)
+        if little and not any((symbols[places] == order).all() for order in orders):
+            orders.append(symbols[places])
+        if len(orders) == SHUFFLES:
+            break
+    return orders
+
+
+def longest_rise(places: NDArray[Any]) -> int:
+    """Length of the longest rising subsequence (Schensted 1961)."""
+    ends: list[int] = []
+    for place in places.tolist():
+        at = bisect.bisect_left(ends, place)
+        ends[at : at + 1] = [place]
+    return len(ends)
+
+
 def _best_shuffled(word: Labels, peaks: stripe_detection.Peaks, symbols: Labels, rates: Rates) -> float:
     """The largest share of code words that fit any of some shuffled orders, the reversed one among them."""
     chosen = peaks.column % EVERY == 0
@@ -116,10 +145,8 @@ def _best_shuffled(word: Labels, peaks: stripe_detection.Peaks, symbols: Labels,
     columns = (len(peaks.start) - 2) // EVERY + 1
     counts = np.bincount(peaks.column[chosen] // EVERY, minlength=columns)
     start = np.concatenate(([0], np.cumsum(counts))).astype(np.int32)
-    generator = np.random.default_rng(2011)
-    orders = [symbols[::-1].copy(), *(generator.permutation(symbols) for _ in range(SHUFFLES - 1))]
     best = 0.0
-    for order in orders:
+    for order in shuffled_orders(symbols):
         path = hidden_markov.best_paths(some, start, hidden_markov.model(order, *rates))
         best = max(best, hidden_markov.fitting(some, path, order))
     return best
