@@ -77,9 +77,9 @@ between towards the dim one.
 Same order in Z, and from a cause that the simulation shows: projector and camera blur take more from the carrier of
 200 cycles than from that of 50, so the four demodulated channels are no equal shifts any more and the phase bends by
 about a thirtieth of the projector; with sharp optics (last row) two thirds of it are gone, and what is left is the
-blur of the pixels themselves. PMP's own error is nothing beside it. X and Y follow from Z along the camera's rays here, as they must in any triangulation; the published ones
-are half as large as Z, several times what rays of this field of view allow, so the published calibration must have
-extrapolated badly at such depths.
+blur of the pixels themselves. PMP's own error is nothing beside it. X and Y follow from Z along the camera's rays
+here, as they must in any triangulation; the published ones are half as large as Z, several times what rays of this
+field of view allow, so the published calibration must have extrapolated badly at such depths.
 """,
     "5.7": """
 The published figures (.74, .48, 2.47 mm) are four times those of table 5.5 from the same method, and the dissertation
