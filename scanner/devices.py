@@ -303,6 +303,8 @@ class TriggerCapabilities:
     """longest dark time and longest exposure"""
     jitter_ns: int
     """a pulse begins within +- this of its edge plus its dark time"""
+    event_bound_ns: int = 500_000
+    """events of pulses are true to this at worst; behind USB the clock's fit is good to a few tenths of a ms"""
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
+from dataclasses import replace
 
 from drivers.simulated.lines import Line, LineName
 from drivers.simulated.options import Settings
@@ -62,7 +63,7 @@ class SimulatedTriggerBoard:
     @property
     def capabilities(self) -> TriggerCapabilities:
         """What it can do."""
-        return CAPABILITIES
+        return replace(CAPABILITIES, event_bound_ns=round(1e3 * self._options.stamp_bound_us))
 
     def program(self, table: Sequence[TableSlot], source: TriggerSource) -> None:
         """Load the whole table; see `scanner.devices.TriggerBoard.program`."""

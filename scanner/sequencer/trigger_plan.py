@@ -21,8 +21,8 @@ from scanner.devices import (
 from scanner.errors import ConfigError
 
 GUARD_NS = 100_000
-"""Between a pattern's certain light and the pulse, and before the next edge: a board's clock fit and its events are
-good to tens of microseconds, and a tenth of a millisecond costs nothing at any refresh."""
+"""Between a pattern's certain light and the pulse, and before the next edge, at least; more where the events of a
+board's pulses are known less well: a tenth of a millisecond costs nothing at any refresh."""
 
 SPARE_PULSES = 1
 """Pulses after the last: a flip that is late by a refresh still gets its frame, and a camera that dropped one edge and
@@ -86,8 +86,13 @@ def trigger_time(
         return 1000 * (slot.dark_us + slot.pulse_us)
     rolling = camera.readout_ns if camera.shutter == "rolling" else 0
     late = camera.line_latency.high_ns if camera.line_latency is not None else 2 * camera.stamp_bound_ns
-    wait = 2 * GUARD_NS + 1000 * board.dark_min_us if board is not None else projector.refresh_ns
+    wait = 2 * guard_ns(board) + 1000 * board.dark_min_us if board is not None else projector.refresh_ns
     return max(spread_ns + wait + late + exposure_ns + rolling, camera.min_period_ns(exposure_ns) + GUARD_NS)
+
+
+def guard_ns(board: TriggerCapabilities | None) -> int:
+    """Time kept around light that changes. An event may be early by its bound, and the bound is taken off once more."""
+    return GUARD_NS if board is None else max(GUARD_NS, 2 * board.event_bound_ns + board.jitter_ns)
 
 
 def table_slot(camera: CameraCapabilities, exposure_ns: int) -> TriggerPlan:
@@ -138,7 +143,7 @@ def trigger_plan(
             "the trigger board has no vertical-sync input, and a board that runs by itself drifts out of step",
             hint="wire the display's vertical sync to the board, or set trigger_mode to software",
         )
-    wanted = delay_ns + GUARD_NS
+    wanted = delay_ns + guard_ns(board)
     lead, dark = divmod(wanted, period_ns)
     room = period_ns - GUARD_NS - 1000 * board.exposure_min_us
     if dark > room:

@@ -25,7 +25,7 @@ from scanner.devices import (
     TriggerSource,
 )
 from scanner.sequencer.plan import Plan
-from scanner.sequencer.trigger_plan import GUARD_NS
+from scanner.sequencer.trigger_plan import GUARD_NS, guard_ns
 
 Take = Callable[[int, Flip, CameraFrame], None]
 """Called with a pattern, its flip and its frame."""
@@ -68,7 +68,8 @@ class TriggeredRounds:
         line = self._camera.capabilities.line_latency
         if isinstance(self._projector, SequencedProjector):
             return self._run_table(self._projector, patterns, Pairing(self._plan, line, with_board=True), take, check)
-        pairing = Pairing(self._plan, line, with_board=self._board is not None)
+        guard = guard_ns(None if self._board is None else self._board.capabilities)
+        pairing = Pairing(self._plan, line, with_board=self._board is not None, guard=guard)
         try:
             self._begin(len(patterns), black)
             hold = (self._plan.dwell - 1) * self._plan.refresh_ns + self._plan.refresh_ns // 2
@@ -147,16 +148,18 @@ class TriggeredRounds:
 class Pairing:
     """Which pattern each frame of a round saw. Pure: stamps and counts in, pattern out."""
 
-    def __init__(self, plan: Plan, line_latency: Interval | None, *, with_board: bool) -> None:
+    def __init__(self, plan: Plan, line_latency: Interval | None, *, with_board: bool, guard: int = GUARD_NS) -> None:
         """Nothing shown yet.
 
         Args:
+            guard: by which pulses follow certain light, ns.
             line_latency: edge to first row's start; None = unknown, and the camera's own stamps stand.
             with_board: pulses have events, and follow the light; else they begin with it.
         """
         self._plan = plan
         self._line = line_latency
         self._with_board = with_board
+        self._guard = guard
         self._flips: list[tuple[int, Flip]] = []
         self._have: set[int] = set()
         self._base: int | None = None
@@ -181,7 +184,7 @@ class Pairing:
         stamped = self._stamped(frame, events)
         exposure = stamped.exposure
         # A board's pulse comes GUARD after certain light; a projector's own comes as light begins, and is too early.
-        slack = exposure.bound_ns + GUARD_NS if self._with_board else -exposure.bound_ns
+        slack = exposure.bound_ns + self._guard if self._with_board else -exposure.bound_ns
         for pattern, flip in reversed(self._flips):
             if exposure.start_ns + slack >= flip.t_ns + self._plan.window_start_ns:
                 if pattern in self._have:
@@ -201,7 +204,7 @@ class Pairing:
         event = min(events, key=lambda one: abs(one.t_ns - frame.exposure.start_ns))
         exact = self._exposure(frame.exposure, event)
         apart = abs(exact.start_ns - frame.exposure.start_ns)
-        if apart > frame.exposure.bound_ns + exact.bound_ns + GUARD_NS:
+        if apart > frame.exposure.bound_ns + exact.bound_ns + self._guard:
             self.uncounted += bool(self._flips)
             return frame
         if not self._counts(frame, event) and frame.exposure.source is Source.ESTIMATED:

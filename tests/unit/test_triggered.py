@@ -10,7 +10,6 @@ import pytest
 
 from drivers.registry import open_camera, open_projector, open_trigger
 from drivers.simulated.sequenced import pack
-from drivers.simulated.trigger_board import CAPABILITIES as BOARD
 from scanner.clock import VirtualClock
 from scanner.devices import (
     CameraCapabilities,
@@ -32,6 +31,7 @@ from scanner.patterns import CameraFormat, McpPattern, PatternSequence
 from scanner.sequencer import Plan, Rig, acquire
 from scanner.sequencer.plan import Mode, plan
 from scanner.sequencer.triggered import Pairing
+from scanner.trigger_protocol import CAPABILITIES
 from tests.unit.sequencer_bench import QUICK, MemorySink, Taken, pmp
 
 MS = 1_000_000
@@ -52,6 +52,7 @@ CAMERA = CameraCapabilities(
     frozenset(TriggerMode),
     line_latency=Interval(5_000, 15_000),
 )
+BOARD = replace(CAPABILITIES, event_bound_ns=5_000)
 SEQUENCE = pmp()
 
 
@@ -80,6 +81,12 @@ def test_light_that_comes_after_the_next_flip_puts_pulses_slots_behind() -> None
     assert made.trigger is not None
     assert made.trigger.lead == 2
     assert made.trigger.dark_us == -(-(40_600_000 - 2 * REFRESH) // 1000)
+
+
+def test_pulses_keep_away_from_changing_light_by_what_their_events_are_unsure_of() -> None:
+    loose = planned(board=replace(BOARD, event_bound_ns=400_000))
+    assert loose.trigger is not None
+    assert loose.trigger.dark_us == 6_301
 
 
 def test_a_long_exposure_takes_more_refreshes() -> None:
@@ -254,6 +261,13 @@ def test_faults_end_in_a_right_cloud_or_in_an_error_that_names_frames(faults: st
     else:
         assert isinstance(taken.acquisition.error, SyncError)
         assert taken.acquisition.error.frames
+
+
+@pytest.mark.parametrize("bound_us", [5, 100, 300, 450])
+def test_events_that_are_known_badly_still_prove_frames(bound_us: int) -> None:
+    taken = take(f"trigger.stamp_bound_us={bound_us}", exposure_ns=8_333_334)
+    assert taken.acquisition.error is None
+    assert {verdict.verdict for verdict in taken.acquisition.verdicts} == {"proved"}
 
 
 @pytest.mark.parametrize("faults", ["drop_pulses=4", "spurious=4", "drop=6&times=1", "source_ends_after=12"])
