@@ -37,8 +37,9 @@ _GROUPS: dict[Kind, str] = {
 
 _SIMULATORS = "fringed.simulators"
 
-LOOKING_S = 10.0
-"""A driver that found nothing in this time is given up: networks are asked for a second, buses answer at once."""
+LOOKING_S = 20.0
+"""A driver that found nothing in this time is given up: networks are asked for a second, buses answer at once,
+and on a busy machine all of them start at the same time."""
 
 _log = logging.getLogger(__name__)
 

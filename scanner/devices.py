@@ -447,6 +447,37 @@ class TriggerDriver(Protocol):
         """The boards this driver can see now."""
 
 
+# --- devices that know what their host must be like ------------------------------------------------------------------
+
+
+class SetupFinding(Protocol):
+    """One thing that a driver looked at on its host."""
+
+    @property
+    def subject(self) -> str:
+        """What was looked at."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether it is well."""
+
+    @property
+    def text(self) -> str:
+        """What was found."""
+
+    @property
+    def command(self) -> str:
+        """What mends it; empty where it is well, or no command could."""
+
+
+@runtime_checkable
+class ChecksSetup(Protocol):
+    """A camera whose driver can tell whether the host is set up for it: buffers, packets, speeds."""
+
+    def check_setup(self, rate_hz: float | None = None) -> Sequence[SetupFinding]:
+        """Look at the host. rate_hz: frames a second wanted; None: as many as the camera gives."""
+
+
 # --- devices that know the truth ---------------------------------------------------------------------------------
 
 

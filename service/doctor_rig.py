@@ -11,7 +11,7 @@ from itertools import pairwise
 from typing import Any
 
 from scanner.clock import Clock
-from scanner.devices import CameraSettings, ProjectorKind, TableSlot, TriggerSource
+from scanner.devices import CameraSettings, ChecksSetup, ProjectorKind, TableSlot, TriggerSource
 from scanner.errors import ScannerError
 from scanner.sequencer import Rig, measure_latency
 from scanner.sequencer.light import Light, measure_light
@@ -33,6 +33,8 @@ MOST_MISFIT = 0.02
 
 PULSES = 20
 
+SMALLER = "take a smaller region or fewer frames a second, or a faster link"
+
 Stage = Callable[[str], None]
 """Told what is measured next."""
 
@@ -47,7 +49,7 @@ def examine_rig(config: RigConfig, clock: Clock, stage: Stage) -> Iterator[Findi
         return
     try:
         yield Finding("devices", Level.OK, f"{opened.rig.camera.name}; {opened.rig.projector.name}")
-        for name, look in (("latency", latency), ("light", light), ("trigger line", pulses)):
+        for name, look in (("host", host), ("latency", latency), ("light", light), ("trigger line", pulses)):
             stage(f"measuring {name}")
             try:
                 yield from look(opened, clock)
@@ -55,6 +57,15 @@ def examine_rig(config: RigConfig, clock: Clock, stage: Stage) -> Iterator[Findi
                 yield Finding(name, Level.BAD, str(error), error.hint or "")
     finally:
         opened.close()
+
+
+def host(opened: OpenRig, clock: Clock) -> Iterator[Finding]:  # noqa: ARG001  (as the others)
+    """What the camera's own driver finds on this machine, at the camera's full rate."""
+    camera = opened.rig.camera
+    if isinstance(camera, ChecksSetup):
+        for found in camera.check_setup():
+            level = Level.OK if found.ok else Level.BAD
+            yield Finding(found.subject, level, found.text, found.command or ("" if found.ok else SMALLER))
 
 
 def latency(opened: OpenRig, clock: Clock) -> Iterator[Finding]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from drivers.registry import open_camera, open_projector
+from drivers.simulated.camera import SimulatedCamera
 from scanner.clock import VirtualClock
 from scanner.sequencer.light import measure_light
 from service import doctor
@@ -119,6 +121,13 @@ def test_a_response_that_is_not_the_calibrations_is_told() -> None:
     found = one(examined("quick/board?gamma=1.8"), "gamma")
     assert found.level is Level.NOTE
     assert "1.80" in found.mend
+
+
+def test_what_a_cameras_driver_finds_on_its_host_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = [SimpleNamespace(subject="packet size", ok=False, text="1500 bytes", command="ip link set ...")]
+    monkeypatch.setattr(SimulatedCamera, "check_setup", lambda self, rate_hz=None: seen, raising=False)
+    found = one(examined("quick/board"), "packet size")
+    assert (found.level, found.mend) == (Level.BAD, "ip link set ...")
 
 
 def test_a_latency_nobody_wrote_down_is_given_in_the_rig_files_words() -> None:
