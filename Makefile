@@ -33,8 +33,9 @@ check: ## format, lint, types, layers
 	@$(bin)/mypy
 	@$(bin)/lint-imports
 
-bench: setup ## the benchmarks, one after the other
-	@for bench in bench/*.py; do echo "== $$bench"; $(bin)/python $$bench || exit 1; done
+bench: setup ## the benchmarks, one after the other; fails in the end if one missed its figures
+	@missed=; for bench in $$(grep -l __main__ bench/*.py); do echo "== $$bench"; \
+	    $(bin)/python $$bench || missed="$$missed $$bench"; done; [ -z "$$missed" ] || { echo "missed:$$missed"; exit 1; }
 
 tables: setup ## the dissertation's tables on the simulated rig, into docs/; ARGS="5.1 gamma" makes some
 	@cd bench && ../$(bin)/python -m tables $(ARGS)

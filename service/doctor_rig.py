@@ -59,7 +59,7 @@ def examine_rig(config: RigConfig, clock: Clock, stage: Stage) -> Iterator[Findi
         opened.close()
 
 
-def host(opened: OpenRig, clock: Clock) -> Iterator[Finding]:  # noqa: ARG001  (as the others)
+def host(opened: OpenRig, clock: Clock) -> Iterator[Finding]:
     """What the camera's own driver finds on this machine, at the camera's full rate."""
     camera = opened.rig.camera
     if isinstance(camera, ChecksSetup):
