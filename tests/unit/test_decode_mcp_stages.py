@@ -209,3 +209,33 @@ def test_dense_rows_keep_a_quadratic_and_stop_at_a_missing_stripe():
     np.testing.assert_allclose(maps.rows[inner, 8], ((at + 0.5) * step - 0.5)[inner], atol=0.05)
     np.testing.assert_allclose(maps.albedo[inner], 90, rtol=1e-5)
     assert np.ptp(maps.rows[inner], axis=1).max() < 1e-3
+
+
+def test_sigma_grows_between_stripes_where_the_surface_bends_or_steps():
+    step, sigma = 27.0, 0.02
+
+    def sigmas(y):
+        count, columns = len(y), 6
+        ones = np.ones(count * columns, np.float32)
+        stripe = np.arange(count, dtype=np.int32)
+        knots = dense.Knots(
+            np.arange(0, count * columns + 1, count, dtype=np.int32),
+            np.tile(np.float32(y), columns),
+            np.tile(np.float32((stripe + 0.5) * step - 0.5), columns),
+            np.float32(sigma) * ones,
+            ones,
+            90 * ones,
+            80 * ones,
+            np.tile(stripe, columns),
+        )
+        return dense.interpolate(knots, (320, 4 * columns), 40.0, step).sigma[:, 8]
+
+    even = sigmas(30 + 40 * np.arange(7))
+    np.testing.assert_allclose(even[75:225], sigma, rtol=0.01)
+    assert even[20] > 1.9 * sigma  # beyond the last stripe
+    curved = sigmas(30 + 36 * np.arange(7) + 0.7 * np.arange(7) ** 2)
+    assert curved[130] > 1.2 * even[130]
+    stepped = sigmas(np.array([30, 70, 110, 165, 205, 245, 285]))
+    assert stepped[137] > 20 * sigma
+    assert stepped[110] > 4 * sigma
+    assert stepped[65] < 2 * sigma  # two stripes away

@@ -22,6 +22,13 @@ Ints = NDArray[np.int32]
 STEP_RATIO = 1.5
 """Neighbouring intervals that differ by more are a step of depth, not a curved surface: a straight line then."""
 
+UNEVEN = np.float32(0.1)
+"""Share of a peak's distance from the middle between its neighbours that its error may be: what bends the surface
+bends the profile within the fit window too. Measured on a bust; a curved surface alone leaves less."""
+
+BEND_LEFT = np.float32(0.25)
+"""Share of the bend between two stripes that a cubic through them leaves (the rest it follows); all of it at a step."""
+
 MARGIN = 0.42
 """Pitches added beyond the last stripe of a run: the part of its flank that the fit has seen."""
 
@@ -99,10 +106,12 @@ def _columns(start: Ints, y: Array, row: Array, stripe: Ints, others: Array, pit
             ):
                 last += 1
             _tangents(y, row, k, last, tangent)
+            _unevenness(y, row, others, k, last)
             if last > k:
                 _ends(b, y, row, others, k, last, tangent, size, narrow)
             for j in range(k, last):
-                _between(b, y, row, others, j, tangent[j - k], tangent[j - k + 1], size, narrow)
+                bend = _bend_of(y, row, j, k, last)
+                _between(b, y, row, others, j, tangent[j - k], tangent[j - k + 1], bend, size, narrow)
             k = last + 1
 
 
@@ -141,14 +150,53 @@ def _tangents(y: Array, row: Array, first: int, last: int, tangent: Array) -> No
 
 
 @kernel
+def _unevenness(y: Array, row: Array, others: Array, first: int, last: int) -> None:
+    """Adds to sigma what uneven distances of the stripes say of a knot; the end of a run is as uncertain as its
+    neighbour, and twice as much by itself: an edge is near.
+    """
+    for j in range(first + 1, last):
+        slope = (row[j + 1] - row[j - 1]) / (y[j + 1] - y[j - 1])
+        off = UNEVEN * slope * (np.float32(0.5) * (y[j - 1] + y[j + 1]) - y[j])
+        others[j, 0] = np.sqrt(others[j, 0] * others[j, 0] + off * off)
+    if last > first + 1:
+        others[first, 0] = max(np.float32(2) * others[first, 0], others[first + 1, 0])
+        others[last, 0] = max(np.float32(2) * others[last, 0], others[last - 1, 0])
+
+
+@kernel
+def _bend_of(y: Array, row: Array, j: int, first: int, last: int) -> np.float32:
+    """How far rows may bend between knots j and j + 1: the larger change of slope at either, over the gap."""
+    gap = y[j + 1] - y[j]
+    slope = (row[j + 1] - row[j]) / gap
+    change = np.float32(0)
+    if j > first:
+        change = abs(slope - (row[j] - row[j - 1]) / (y[j] - y[j - 1]))
+    if j + 1 < last:
+        change = max(change, abs(slope - (row[j + 2] - row[j + 1]) / (y[j + 2] - y[j + 1])))
+    bent: np.float32 = change * gap
+    return bent
+
+
+@kernel
 def _between(
-    b: int, y: Array, row: Array, others: Array, j: int, left: np.float32, right: np.float32, size: int, narrow: Array
+    b: int,
+    y: Array,
+    row: Array,
+    others: Array,
+    j: int,
+    left: np.float32,
+    right: np.float32,
+    unknown: np.float32,
+    size: int,
+    narrow: Array,
 ) -> None:
     gap = y[j + 1] - y[j]
     rise = row[j + 1] - row[j]
     slope = rise / gap
     if left < 0 or right < 0:
         left = right = slope
+    else:
+        unknown *= BEND_LEFT
     a = max(int(np.ceil(y[j])), 0)
     for q in range(a, min(int(np.floor(y[j + 1])), size - 1) + 1):
         t = (q - y[j]) / gap
@@ -156,7 +204,8 @@ def _between(
         # Hermite, written as the line plus what the tangents add.
         bend = t * u * (u * (left - slope) - t * (right - slope)) * gap
         narrow[0, b, q] = row[j] + rise * t + bend
-        narrow[1, b, q] = u * others[j, 0] + t * others[j + 1, 0]
+        # Most is unknown half way: a parabola that is nothing at the knots.
+        narrow[1, b, q] = u * others[j, 0] + t * others[j + 1, 0] + t * u * unknown
         narrow[2, b, q] = min(others[j, 1], others[j + 1, 1])
         narrow[3, b, q] = u * others[j, 2] + t * others[j + 1, 2]
         narrow[4, b, q] = u * others[j, 3] + t * others[j + 1, 3]

@@ -38,6 +38,10 @@ a third of its flank leaves as much."""
 MOST_BEND = 0.3
 """Change of the pitch from one stripe to the next, in pitches, above which there is a step of depth between them."""
 
+ALIKE = np.float32(1.7)
+"""Neighbouring samples of a profile are alike: lens and projector blur by a pixel (a Gaussian of sigma s leaves one
+independent sample in 2 sqrt(pi) s, three for .7 px each), so that there are a third as many."""
+
 SIGMA_FLOOR = np.float32(0.005)
 """Error that no residual shows: the pattern's own 8 bits, px."""
 
@@ -245,7 +249,7 @@ def _refine(
                 oo - 2 * shift * os - 2 * slope * ov + shift * shift * ss + 2 * shift * slope * sv + slope * slope * vv
             )
             rough = np.sqrt(max(left, np.float32(0)) / np.float32(max(used[p] - 2, 1)))
-            sigma[k] = rough / np.sqrt(ss) + SIGMA_FLOOR
+            sigma[k] = ALIKE * rough / np.sqrt(ss) + SIGMA_FLOOR
             y[k] = guess[k] + shift
             far = abs(shift) > np.float32(0.35) * np.float32(reach)
             whole[k] = 0 if far or rough > ROUGH * height[k] else 1
