@@ -1,24 +1,29 @@
-"""Speed of PMP and Gray code decoding: frames as they come, then what is left to do after the last one. One thread.
+"""Speed of PMP and Gray code decoding, as times and as ratios to what is measured beside them in the same run.
 
     python bench/pmp.py [--size 1392x1040] [--bits 8] [--frequencies 1,8,64] [--shifts 8] [--runs 15] [--gray]
 
-Prints, as medians: ms a frame for taking it (the set's fit included), ms after the last frame, and their sum as a ratio
-to reading all frames once and writing the maps, measured in the same run. Frames rotate over several stacks, so that
-none is still in a cache from the run before.
+For one thread and for as many as there are: ms to decode frames that are all at hand; ms a frame and after the last one
+where they come one by one; reading all frames once and writing two float32 maps; a decode with OpenCV and NumPy; and
+`fringes` (PyPI, mode "fast"), if it is installed. Frames rotate over several stacks, so that none is still in a cache
+from the run before. Medians and least times; a decoder and its maps are made before its time runs, as in a scan.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import time
+from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import numpy as np
 
-from scanner.decode import decoder_for, graycode, pmp
+from scanner.decode import graycode, pmp
+from scanner.decode.strips import threads_to_use
 from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, PmpPattern, ProjectorSize
 
 PROJECTOR = ProjectorSize(1152, 864)
-STACKS = 3
+STACKS = 4
 
 
 def main():
@@ -34,25 +39,103 @@ def main():
     camera = CameraFormat(width, height, chosen.bits)
     if chosen.gray:
         sequence = PatternSequence(PROJECTOR, GrayPattern(("x", "y"), 11, 11, inverse=True))
+        kind = graycode.GrayDecoder
         graycode.warm_up()
     else:
         frequencies = tuple(float(f) for f in chosen.frequencies.split(","))
         sequence = PatternSequence(PROJECTOR, PmpPattern(("y",), frequencies, (chosen.shifts,) * len(frequencies)))
+        kind = pmp.PmpDecoder
         pmp.warm_up()
     stacks = [frames_of(sequence, camera, seed) for seed in range(STACKS)]
-    adding, finishing, memory, decided = [], [], [], []
-    for run in range(chosen.runs):
-        add, finish, share = decode(sequence, camera, stacks[run % STACKS])
-        adding.append(add)
-        finishing.append(finish)
-        decided.append(share)
-        memory.append(read_and_write(stacks[(run + 1) % STACKS], 2 if chosen.gray else 1))
-    count, whole = len(sequence), np.array(adding) + np.array(finishing)
-    print(f"{count} frames {width} x {height}, {camera.dtype}, {min(decided):.1%} decided")
-    print(f"  take a frame          {np.median(adding) / count:7.2f} ms")
-    print(f"  after the last        {np.median(finishing):7.2f} ms")
-    print(f"  all of it             {np.median(whole):7.2f} ms")
-    print(f"  read once, write maps {np.median(memory):7.2f} ms      ratio {np.median(whole) / np.median(memory):.1f}")
+    print(f"{len(sequence)} frames {width} x {height}, {camera.dtype}; ms, median (least)")
+    for threads in sorted({1, threads_to_use()}):
+        measure(kind, sequence, camera, stacks, chosen.runs, threads)
+    if not chosen.gray:
+        measure_others(sequence, camera, stacks)
+
+
+def measure(kind, sequence, camera, stacks, runs, threads):
+    """Print the rows of one number of threads."""
+    whole, adding, finishing, floor, decided = [], [], [], [], []
+    for run in range(runs):
+        decoder = kind(sequence, camera, threads=threads)
+        frames = stacks[run % STACKS]
+        begin = time.perf_counter()
+        for position, frame in enumerate(frames):
+            decoder.keep(position, frame)
+        found = decoder.finish()
+        whole.append(time.perf_counter() - begin)
+        decided.append(float(np.mean(found.reason == 0)))
+        floor.append(read_and_write(stacks[(run + 2) % STACKS], threads))
+        decoder = kind(sequence, camera, threads=threads)
+        begin = time.perf_counter()
+        for position, frame in enumerate(stacks[(run + 1) % STACKS]):
+            decoder.add(position, frame)
+        middle = time.perf_counter()
+        decoder.finish()
+        adding.append((middle - begin) / len(sequence))
+        finishing.append(time.perf_counter() - middle)
+    name = "one thread" if threads == 1 else f"{threads} threads"
+    print(f"{name}, {min(decided):.1%} decided")
+    for label, times in (
+        ("all frames at hand", whole),
+        ("one by one: a frame", adding),
+        ("one by one: after the last", finishing),
+        ("read once, write two maps", floor),
+    ):
+        ratio = f"   {np.median(times) / np.median(floor):5.2f} x the last row" if times is not floor else ""
+        print(f"  {label:28s}{1e3 * np.median(times):8.2f} ({1e3 * min(times):.2f}){ratio}")
+
+
+def measure_others(sequence, camera, stacks):
+    """Print what others need for the same frames; one thread is theirs to choose."""
+    ours = []
+    for run in range(6):
+        decoder = pmp.PmpDecoder(sequence, camera)
+        begin = time.perf_counter()
+        for position, frame in enumerate(stacks[run % STACKS]):
+            decoder.keep(position, frame)
+        decoder.finish()
+        ours.append(time.perf_counter() - begin)
+    others = {"OpenCV and NumPy": lambda frames: plain_decode(sequence.pattern, frames)}
+    if importlib.util.find_spec("fringes") is not None:
+        others['fringes, mode "fast"'] = decoder_of_fringes(sequence.pattern)
+    else:
+        print("fringes is not installed: no comparison with it")
+    for name, decode in others.items():
+        decode(stacks[0])
+        times = []
+        for run in range(3):
+            begin = time.perf_counter()
+            decode(stacks[(run + 1) % STACKS])
+            times.append(time.perf_counter() - begin)
+        print(f"{name:30s}{1e3 * np.median(times):8.1f}   {np.median(times) / np.median(ours):5.1f} x ours")
+
+
+def plain_decode(pattern, frames):
+    """Rows and modulation over mean, as a tutorial has it: for sets whose first has one period."""
+    absolute, before, first = None, None, 0
+    for f, shifts in zip(pattern.frequencies, pattern.shifts, strict=True):
+        samples = frames[first : first + shifts].astype(np.float32)
+        alpha = pattern.sign * 2 * np.pi * np.arange(shifts) / shifts + pattern.offset
+        p = np.tensordot(np.cos(alpha).astype(np.float32), samples, 1)
+        q = np.tensordot(-np.sin(alpha).astype(np.float32), samples, 1)
+        cycles = cv2.phase(p, q) / (2 * np.pi)
+        absolute = cycles if absolute is None else cycles + np.rint(absolute * (f / before) - cycles)
+        confidence = cv2.magnitude(p, q) / np.maximum(samples.mean(axis=0), 1)
+        before, first = f, first + shifts
+    return absolute / before * PROJECTOR.height - pattern.origin, confidence
+
+
+def decoder_of_fringes(pattern):
+    """The decode of the package `fringes` for the same sets (GPL; never a dependency)."""
+    from fringes import Fringes  # noqa: PLC0415  (GPL: only where a user has installed it)
+
+    fringes = Fringes(Y=PROJECTOR.height, X=PROJECTOR.width, D=1, axis=1)
+    fringes.N = list(pattern.shifts)
+    fringes.v = list(pattern.frequencies)
+    fringes.mode = "fast"
+    return fringes.decode
 
 
 def frames_of(sequence, camera, seed):
@@ -72,26 +155,28 @@ def frames_of(sequence, camera, seed):
     return stack
 
 
-def decode(sequence, camera, stack):
-    """ms to take all frames, ms to finish, share of pixels decided."""
-    decoder = decoder_for(sequence, camera)
-    begin = time.perf_counter()
-    for position, frame in enumerate(stack):
-        decoder.add(position, frame)
-    middle = time.perf_counter()
-    found = decoder.finish()
-    end = time.perf_counter()
-    return 1e3 * (middle - begin), 1e3 * (end - middle), float(np.mean(found.reason == 0))
+_maps = {}
 
 
-def read_and_write(stack, axes):
-    """ms to read every frame once and to write an axis's maps and the common ones, where memory is already there."""
+def read_and_write(stack, threads):
+    """Seconds to read every frame once and to write two maps, where memory is already there."""
     words = stack.reshape(-1).view(np.uint64)
-    maps = np.zeros((2 * axes + 3, *stack.shape[1:]), np.float32)
+    maps = _maps.setdefault(stack.shape[1:], np.full(2 * stack[0].size, 0, np.float32))
+
+    def part(i):
+        np.bitwise_or.reduce(words[i * words.size // threads : (i + 1) * words.size // threads])
+        maps[i * maps.size // threads : (i + 1) * maps.size // threads].fill(1)
+
     begin = time.perf_counter()
-    np.bitwise_or.reduce(words)
-    maps.fill(1)
-    return 1e3 * (time.perf_counter() - begin)
+    if threads == 1:
+        part(0)
+    else:
+        with ThreadPoolExecutor(threads - 1) as pool:
+            others = [pool.submit(part, i) for i in range(1, threads)]
+            part(0)
+            for other in others:
+                other.result()
+    return time.perf_counter() - begin
 
 
 if __name__ == "__main__":

@@ -1,0 +1,197 @@
+"""The projector's response from a PMP scan: how far its light is from the fringes that were meant.
+
+Light that follows a power of what was meant gives fringes harmonics. With three shifts they cannot be told from a shift
+of the fringe, and the surface gets ripples of that fringe's period; frames of several frequencies contradict one
+another all the same. The exponent sought is the one under which all frames of a pixel agree best on one projector
+coordinate (after Guo, He, Zhang 2004, with the coordinate common to all sets in place of a histogram). What it finds
+is to be applied at projection. No part of decoding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from scanner.decode import decoder_for
+from scanner.errors import CalibrationError
+from scanner.patterns import CameraFormat, PatternSequence, PmpPattern
+from scanner.patterns.pmp import AMPLITUDE, MEAN, FringeSet
+
+PIXELS = 1000
+"""Decided pixels that are looked at: an exponent is good to .01 with 8-bit frames."""
+
+LOWEST, HIGHEST = 0.3, 3.5
+"""Exponents between which one is sought."""
+
+KEPT = 0.8
+"""Share of the pixels that have a say, those that fit best: edges and mixed pixels fit no response."""
+
+_STEPS = 3
+_TINY = 1e-9
+
+
+@dataclass(frozen=True)
+class Response:
+    """What a projector does to light that was meant to be linear."""
+
+    exponent: float
+    """light shown = light meant ^ exponent; 1 is right"""
+    sigma: float
+    """1-sigma of the exponent"""
+    gamma: float | None
+    """precorrection to project with from now on: that of the capture times the exponent; None where it was a table"""
+    ripple_px: float
+    """rms of the error that this exponent has put into the capture's coordinates, projector px"""
+    misfit_before: float
+    misfit_after: float
+    """rms of what the frames leave, share of the fringes' height: with exponent 1, and with the one found"""
+    pixels: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data."""
+        return asdict(self)
+
+
+def response_of_frames(
+    sequence: PatternSequence, camera: CameraFormat, frames: Sequence[NDArray[Any]], seed: int = 0
+) -> Response:
+    """The response that a PMP capture's own frames tell.
+
+    Args:
+        frames: all of the sequence, in order.
+        seed: of the choice of pixels.
+
+    Raises:
+        CalibrationError: not PMP, one set of three shifts, or too few pixels decided.
+        DecodeError: the frames cannot be decoded.
+    """
+    pattern = sequence.pattern
+    if not isinstance(pattern, PmpPattern):
+        raise CalibrationError(
+            f"the response is told by fringes, and this is a capture of method {pattern.method}",
+            hint="capture any PMP sequence: fringed scan --method pmp",
+        )
+    axis = pattern.axes[0]
+    sets = [s for s in pattern.sets() if s.axis == axis]
+    samples_each = sum(s.shifts for s in sets)
+    if samples_each <= len(sets) + 2:
+        raise CalibrationError(
+            "one set of three shifts fits any response", hint="use two frequencies or more, or four shifts or more"
+        )
+    decoder = decoder_for(sequence, camera)
+    for position, frame in enumerate(frames):
+        decoder.add(position, frame)
+    found = decoder.finish()
+    coordinate = found.rows if axis == "y" else found.columns
+    if coordinate is None:
+        raise AssertionError("a decoder gives what its pattern has")
+    decided = np.flatnonzero(np.isfinite(coordinate))
+    if decided.size < 200:
+        raise CalibrationError(
+            f"{decided.size} pixels decided: too few to tell a response", hint="capture a plain, bright surface"
+        )
+    chosen = np.random.default_rng(seed).choice(decided, min(PIXELS, decided.size), replace=False)
+    grey = np.stack(
+        [frames[sequence.fringes[s.first + n]].reshape(-1)[chosen] for s in sets for n in range(s.shifts)], axis=1
+    ).astype(np.float64)
+    problem = _Problem(grey, coordinate.reshape(-1)[chosen].astype(np.float64), _angles(pattern, sets, sequence), sets)
+    return _solve(problem, sequence)
+
+
+def _solve(problem: _Problem, sequence: PatternSequence) -> Response:
+    best = minimize_scalar(lambda e: problem.misfit(e)[0], bounds=(LOWEST, HIGHEST), method="bounded")
+    exponent, step = float(best.x), 0.02
+    here, shifted = problem.misfit(exponent)
+    before, plain = problem.misfit(1.0)
+    bend = (problem.misfit(exponent + step)[0] - 2 * here + problem.misfit(exponent - step)[0]) / step**2
+    count = problem.kept * problem.freedom
+    sigma = float(np.sqrt(2 * here / count / max(bend, _TINY))) if count else float("inf")
+    away = shifted - plain
+    ripple = float(np.sqrt(np.mean(np.sort(away**2)[: problem.kept])))
+    share = 1 / problem.grey.shape[1] / problem.kept
+    given = sequence.precorrection
+    prior = 1.0 if given is None else given.gamma
+    return Response(
+        exponent, sigma, None if prior is None else prior * exponent, ripple,
+        float(np.sqrt(before * share)), float(np.sqrt(here * share)), len(problem.grey),
+    )  # fmt: skip
+
+
+def _angles(
+    pattern: PmpPattern, sets: Sequence[FringeSet], sequence: PatternSequence
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(F,) radians a projector pixel, and radians at coordinate 0, of every frame."""
+    along = sequence.projector.along(sets[0].axis)
+    rate, start = [], []
+    for s in sets:
+        for n in range(s.shifts):
+            rate.append(2 * np.pi * s.frequency / along)
+            start.append(rate[-1] * pattern.origin + pattern.sign * 2 * np.pi * n / s.shifts + pattern.offset)
+    return np.array(rate), np.array(start)
+
+
+class _Problem:
+    """Grey levels of some pixels, to be explained by I = a + b_k light(y)^e: a, b_k and y are each pixel's own.
+
+    grey: (n, F). start: (n,) coordinates. angles: see `_angles`. sets: of the frames.
+    """
+
+    def __init__(
+        self,
+        grey: NDArray[np.float64],
+        start: NDArray[np.float64],
+        angles: tuple[NDArray[np.float64], NDArray[np.float64]],
+        sets: Sequence[FringeSet],
+    ) -> None:
+        self.grey = grey
+        self._start = start
+        self._rate, self._offset = angles
+        self._member = np.repeat(np.eye(len(sets)), [s.shifts for s in sets], axis=0)
+        self.freedom = grey.shape[1] - len(sets) - 2
+        self.kept = int(KEPT * len(grey))
+
+    def misfit(self, exponent: float) -> tuple[float, NDArray[np.float64]]:
+        """(sum of squared residuals over squared fringe height, of the pixels that fit best; coordinates (n,))."""
+        y = self._start
+        parameters = self._linear(y, exponent)
+        for _ in range(_STEPS):
+            light, slope = self._light(y, exponent)
+            heights = parameters[:, 1:] @ self._member.T
+            jacobian = np.concatenate([self._columns(light), (heights * slope)[:, :, None]], axis=2)
+            change = _least_squares(jacobian, self.grey - parameters[:, :1] - heights * light)
+            parameters = parameters + change[:, :-1]
+            y = y + np.clip(change[:, -1], -5, 5)
+        light, _ = self._light(y, exponent)
+        heights = parameters[:, 1:] @ self._member.T
+        left = (self.grey - parameters[:, :1] - heights * light) ** 2 / np.maximum(heights.mean(axis=1), 1.0)[
+            :, None
+        ] ** 2
+        return float(np.sort(left.sum(axis=1))[: self.kept].sum()), y
+
+    def _linear(self, y: NDArray[np.float64], exponent: float) -> NDArray[np.float64]:
+        light, _ = self._light(y, exponent)
+        return _least_squares(self._columns(light), self.grey)
+
+    def _columns(self, light: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, F, 1 + K): what a and b_k add to each grey level."""
+        return np.concatenate([np.ones((*light.shape, 1)), light[:, :, None] * self._member], axis=2)
+
+    def _light(self, y: NDArray[np.float64], exponent: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Light and its slope by y, (n, F)."""
+        angle = y[:, None] * self._rate + self._offset
+        meant = MEAN + AMPLITUDE * np.cos(angle)
+        slope = -AMPLITUDE * np.sin(angle) * self._rate
+        return meant**exponent, exponent * meant ** (exponent - 1) * slope
+
+
+def _least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, m) solutions of n small problems, design (n, F, m), values (n, F)."""
+    normal = np.einsum("nfi,nfj->nij", design, design)
+    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(normal.shape[1])
+    right = np.einsum("nfi,nf->ni", design, values)
+    return np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0])
