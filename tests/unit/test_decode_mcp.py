@@ -193,6 +193,30 @@ def test_another_code_order_than_described_is_refused():
         decode_image(frame, replace(OWN, codes=(7, 0, 2, 6, 1, 5, 3, 4)), PROJECTOR, CAMERA)
 
 
+def test_a_code_order_that_was_rotated_is_refused_where_it_begins_again():
+    frame, _ = render(OWN)
+    for shift in (2, 4, 6):
+        with pytest.raises(DecodeError, match="contradict"):
+            decode_image(frame, replace(OWN, codes=OWN.codes[shift:] + OWN.codes[:shift]), PROJECTOR, CAMERA)
+
+
+@pytest.mark.parametrize("bits", [2, 4])
+def test_other_bits_than_described_are_refused(bits):
+    frame, _ = render(OWN)
+    carriers = (34.0, 47.0, 62.0, 76.0)[:bits]
+    with pytest.raises(DecodeError):
+        decode_image(
+            frame, replace(OWN, bits=bits, carriers=carriers, codes=tuple(range(1 << bits))), PROJECTOR, CAMERA
+        )
+
+
+def test_stripes_too_fine_for_the_camera_are_refused():
+    frame, _ = render(OWN)
+    small = cv2.resize(frame, (96, 72), interpolation=cv2.INTER_AREA)
+    with pytest.raises(DecodeError):
+        decode_image(small, OWN, PROJECTOR, CameraFormat(96, 72))
+
+
 def test_a_tiny_image_is_refused():
     with pytest.raises(DecodeError, match="smaller"):
         decode_image(np.zeros((16, 16), np.uint8), OWN, PROJECTOR, CameraFormat(16, 16))

@@ -229,7 +229,9 @@ class Agreement:
 
     clear: share of the peaks whose own carriers name a code word clearly (other than "all off", which unmodulated
     stripes show too). agree: share of these that the columns' model took for a stripe of that word. order: share of
-    neighbouring stripes in a column that follow one another. hits: share of switched-on carriers seen with more than
+    neighbouring stripes in a column that follow one another. wraps: how often, in a whole pattern's height, one of its
+    last stripes is followed by one of its first without a gap, which no surface does but a code order that was rotated
+    (about once) or exchanged carriers do. hits: share of switched-on carriers seen with more than
     half their amplitude.
     """
 
@@ -237,6 +239,7 @@ class Agreement:
     agree: float
     order: float
     hits: float
+    wraps: float
 
     @property
     def holds(self) -> bool:
@@ -245,9 +248,10 @@ class Agreement:
         On simulated scenes from boards to strong texture agree was .94 or more, hits .93 (.80 on the strongest); with
         another code order agree was .77 or less; with other carriers, fewer or more bits, fringes or an upside-down
         image few clear words were left and hits were .78 or less. The limits stand between. Without clear words there
-        is no telling: a wrong magnification fits them all.
+        is no telling: a wrong magnification fits them all. Steps of depth jump back by a few stripes, never by half of
+        them along a third of the image.
         """
-        return self.clear >= 0.02 and self.agree >= 0.85 and self.hits >= 0.7
+        return self.wraps < 0.3 and self.clear >= 0.02 and self.agree >= 0.85 and self.hits >= 0.7
 
 
 def agreement(
@@ -278,9 +282,9 @@ def agreement(
     follows = path == np.roll(path, 1) + 1
     own = model.ratio[np.maximum(path, 0)] * (path >= 0)[:, None]
     over = seen.ratio > 0.5 * modulation * own
-    return Agreement(
-        *(float(part.mean()) if part.size else 0.0 for part in (clear, agrees[clear], follows[pair], over[own > 0]))
-    )
+    wraps = np.roll(path, 1) - path > model.stripes // 2
+    parts = (clear, agrees[clear], follows[pair], over[own > 0], wraps[pair] * model.stripes)
+    return Agreement(*(float(part.mean()) if part.size else 0.0 for part in parts))
 
 
 def refined_modulation(seen: Amplitudes, model: PatternModel, posterior: Array, previous: Array) -> tuple[Array, Array]:
