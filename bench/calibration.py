@@ -73,7 +73,7 @@ def take(device, pattern, exposure_ns=30_000_000):
     return found
 
 
-def calibrated(rig, target, seed, hold_out=False):
+def calibrated(rig, target, seed):
     """(solution, true calibration, seconds of solving) from the simulated poses."""
     spec = parse_target(SPECS[target])
     observations, left_out = [], []
@@ -86,7 +86,7 @@ def calibrated(rig, target, seed, hold_out=False):
             observations.append(Observation(view, true.camera.size, true.projector.size))
     begun = time.perf_counter()
     options = SolveOptions(length=(spec.longest_mm, LENGTH_SIGMA_MM))
-    solution = solve(spec, observations, options, left_out, hold_out=hold_out)
+    solution = solve(spec, observations, options, left_out)
     return solution, true, time.perf_counter() - begun
 
 

@@ -6,7 +6,7 @@ scan of that pose would have along and across the epipolar lines, in projector p
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,29 +14,52 @@ from numpy.typing import NDArray
 
 from scanner.calibration.adjustment import Adjusted, adjust_again
 from scanner.calibration.lens_slopes import rotation_of
-from scanner.calibration.problem import Problem, State, sheet_points
+from scanner.calibration.problem import SHEET, Problem, State, sheet_points
 
 Array = NDArray[np.float64]
 
 MOST_TRIED = 12
 """Views left out in turn; of more, as many evenly chosen."""
 FEWEST_LEFT = 3
+FEWEST_FOR_SPREAD = 8
+"""Views from which the jackknife's variance is worth using: it is known to the root of two over their number."""
 
 
-def held_out_errors(problem: Problem, adjusted: Adjusted) -> Array:
-    """(V,) px rms in the projector of each view, predicted by the others; NaN where not tried."""
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """errors: (V,) px rms in the projector of each view, predicted by the others; NaN where not tried. inflation: by
+    which the formal covariance must be multiplied for the rig to move as much as it does from view to view; 1 or more.
+    """
+
+    errors: Array
+    inflation: float = 1.0
+
+
+def hold_out(problem: Problem, adjusted: Adjusted) -> HeldOut:
+    """Leave every view out in turn, of flat targets in more than three.
+
+    The inflation is the jackknife's variance (Tukey 1958) over the formal one, median over the rig's parameters: what
+    is common to a whole view, such as blur or a sheet that bends anew each time, is seen by it and not by residuals.
+    """
     count = len(problem.views)
     errors = np.full(count, np.nan)
     if count <= FEWEST_LEFT or not problem.target.flat:
-        return errors
+        return HeldOut(errors)
     tried = np.unique(np.linspace(0, count - 1, min(count, MOST_TRIED)).round().astype(int))
+    moved = []
     for k in tried:
         rest = [i for i in range(count) if i != k]
         part = replace(problem, views=tuple(problem.views[i].only(adjusted.kept[i]) for i in rest))
         begun = replace(adjusted.state, poses=adjusted.state.poses[rest])
         others = adjust_again(part, begun, (adjusted.sigma_camera, adjusted.projector_factor))
         errors[k] = _predicted(problem, others, k, adjusted.kept[k])
-    return errors
+        moved.append(others.vector()[: SHEET.start] - adjusted.state.vector()[: SHEET.start])
+    if count < FEWEST_FOR_SPREAD:
+        return HeldOut(errors)
+    formal = np.diag(adjusted.covariance)[: SHEET.start]
+    spread = (count - 1) * np.mean(np.square(moved), axis=0)
+    known = formal > 0
+    return HeldOut(errors, max(1.0, float(np.median(spread[known] / formal[known]))))
 
 
 def _predicted(problem: Problem, state: State, k: int, kept: NDArray[np.bool_]) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scanner.calibration.adjustment import Adjusted, adjust
 from scanner.calibration.discs import eccentricity
-from scanner.calibration.held_out import held_out_errors
+from scanner.calibration.held_out import HeldOut, hold_out
 from scanner.calibration.lens_slopes import rotation_of
 from scanner.calibration.observe import LeftOut, Observation
 from scanner.calibration.plausibility import (
@@ -80,7 +80,7 @@ class SolveOptions:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A calibrated rig and how good it is. held_out: see `held_out_errors`."""
+    """A calibrated rig and how good it is. held_out: `HeldOut.errors`."""
 
     target: Target
     options: SolveOptions
@@ -115,9 +115,10 @@ def solve(
     left_out: Sequence[LeftOut] = (),
     progress: Progress | None = None,
     *,
-    hold_out: bool = True,
+    leave_out: bool = True,
 ) -> Solution:
-    """Calibrate. hold_out: leave every view out in turn, which takes as long as the rest.
+    """Calibrate. leave_out: leave every view out in turn, which takes as long as the rest, and widen the covariance by
+    how much the rig moves.
 
     Raises:
         CalibrationError: too few usable views, or a result that cannot be; with the likely cause.
@@ -148,7 +149,8 @@ def solve(
     check_state(problem, adjusted)
     warnings = check_stated(problem, adjusted.state, options.baseline_mm, options.distance_mm)
     tell("leaving views out")
-    held_out = held_out_errors(problem, adjusted) if hold_out else np.full(len(problem.views), np.nan)
+    held_out = hold_out(problem, adjusted) if leave_out else HeldOut(np.full(len(problem.views), np.nan))
+    adjusted = replace(adjusted, covariance=held_out.inflation * adjusted.covariance)
     used = {view.name for view in problem.views}
     taken = sorted(o.created for o in observations if o.created and o.view.name in used)
     solution = Solution(
@@ -157,7 +159,7 @@ def solve(
         problem,
         adjusted,
         facing,
-        held_out,
+        held_out.errors,
         epipolar_errors(problem, adjusted.state),
         tuple(out),
         (),

@@ -61,7 +61,7 @@ def solve_hall(
         CalibrationError: too few points, or a result that cannot be.
     """
     if target.flat:
-        return _of_poses(solve(target, observations, options, left_out, progress, hold_out=False))
+        return _of_poses(solve(target, observations, options, left_out, progress, leave_out=False))
     if not observations:
         why = left_out[0].reason if left_out else "no capture was given"
         raise CalibrationError(f"no capture shows the target: {why}", hint="capture the target, both axes")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from service.commands import calibrate_response, calibrate_solve, calibrate_sync, calibrate_target
+from service.commands import calibrate_response, calibrate_solve, calibrate_sync, calibrate_target, calibrate_verify
 
 group = typer.Typer(
     help="Calibrate a rig: print a target, solve from captures of it, check the result.",
@@ -13,5 +13,7 @@ group = typer.Typer(
 )
 group.command("solve")(calibrate_solve.solve)
 group.command("target")(calibrate_target.target)
+group.command("verify")(calibrate_verify.verify)
+group.command("mcp")(calibrate_verify.mcp)
 group.command("sync")(calibrate_sync.sync)
 group.command("response")(calibrate_response.response)

@@ -1,0 +1,207 @@
+"""`fringed calibrate verify` and `mcp`: what a calibrated rig's scans are worth, by features that are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.commands.calibrate_solve import Replace
+from service.commands.options import AsJson, output_path
+from service.terminal import print_error, print_facts, print_json, print_table, progress_lines
+
+if TYPE_CHECKING:
+    from scanner.scan import Scan
+
+
+def verify(
+    scans: Annotated[list[Path], typer.Argument(metavar="SCAN...", help="Scans' folders, with points.")],
+    flat: Annotated[bool, typer.Option("--flat", help="A flat board: flatness, rms, bow.")] = False,
+    sphere: Annotated[
+        float | None,
+        typer.Option(metavar="MM", min=0.1, max=1e5, help="A sphere of this diameter: form and size error."),
+    ] = None,
+    target: Annotated[
+        str | None,
+        typer.Option(metavar="TARGET", help="A target, as in solve: the length of its longest row of points."),
+    ] = None,
+    length: Annotated[
+        float | None,
+        typer.Option(metavar="MM", min=0.1, max=1e5, help="With --target: that length as measured; else as nominal."),
+    ] = None,
+    repeat: Annotated[
+        bool, typer.Option("--repeat", help="The scans are of one scene that did not move: repeatability.")
+    ] = False,
+    tolerance: Annotated[
+        float | None, typer.Option(metavar="MM", min=0, max=1e4, help="Exit status 1 if an error is larger than this.")
+    ] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Measure known features in scans, in the words of VDI/VDE 2634 part 2.
+
+    \b
+    Examples:
+      fringed calibrate verify board/ --flat --tolerance 0.2
+      fringed calibrate verify ball1 ball2 ball3 --sphere 50.012
+      fringed calibrate verify target/ --target charuco:10x7:30 --length 240.05
+      fringed calibrate verify board1 board2 board3 --flat --repeat --json
+    """
+    if not (flat or sphere is not None or target is not None or repeat):
+        raise typer.BadParameter("nothing to verify: give --flat, --sphere MM, --target TARGET or --repeat")
+    if length is not None and target is None:
+        raise typer.BadParameter("--length is the length of a target's longest row: give --target too")
+    if repeat and len(scans) < 2:
+        raise typer.BadParameter("--repeat compares scans with each other: give two or more, 20 are good")
+    with progress_lines() as lines:
+        lines.stage("reading scans", len(scans))
+        from scanner.calibration.targets import parse_target  # noqa: PLC0415
+        from scanner.calibration.verification import plain, repeatability  # noqa: PLC0415
+        from scanner.scan import load_scan  # noqa: PLC0415
+
+        wanted = None if target is None else parse_target(target)
+        results, clouds = [], []
+        for number, folder in enumerate(scans):
+            scan = load_scan(folder)
+            measured = _measured(folder, scan, flat=flat, sphere_mm=sphere, target=wanted, length_mm=length)
+            results.append({"scan": str(folder), **measured})
+            if repeat and scan.xyz is not None:
+                clouds.append(scan.xyz)
+            lines.advance(number + 1, len(scans))
+        document: dict[str, Any] = {"scans": results}
+        if repeat:
+            document["repeatability"] = plain(repeatability(clouds))
+    worst = _worst(document)
+    document["largest_error_mm"] = worst
+    if as_json:
+        print_json(document)
+    else:
+        _show(document)
+    if tolerance is not None and not worst <= tolerance:
+        print_error(f"the largest error is {worst:.4f} mm, {tolerance:g} mm are allowed")
+        return 1
+    return 0
+
+
+def mcp(
+    pmp: Annotated[Path, typer.Argument(metavar="PMP-SCAN", help="A PMP scan of a matt white flat board.")],
+    single: Annotated[Path, typer.Argument(metavar="MCP-SCAN", help="An MCP scan of it, nothing moved between.")],
+    calibration: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Calibration file to which the fit is to be added.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="FILE", parser=output_path, help="With --calibration: the new file."),
+    ] = None,
+    force: Replace = False,
+    as_json: AsJson = False,
+) -> int:
+    """Check MCP's stripes against PMP's rows on one flat board: the code-to-phase fit of the dissertation.
+
+    The decoder knows the pattern, so the fit is a check: its line must be the ideal one.
+
+    \b
+    Examples:
+      fringed calibrate mcp board-pmp/ board-mcp/
+      fringed calibrate mcp board-pmp/ board-mcp/ --calibration rig.json -o rig-mcp.json
+    """
+    if (calibration is None) != (output is None):
+        raise typer.BadParameter("--calibration FILE and -o FILE belong together")
+    if output is not None and output.exists() and not force:
+        raise typer.BadParameter(f"-o: {output} exists; --force replaces it")
+    from scanner.calibration.calibration_file import as_text, content_id  # noqa: PLC0415
+    from scanner.calibration.mcp_phase import NOTABLE_PX, mcp_phase  # noqa: PLC0415
+    from scanner.geometry import load_calibration  # noqa: PLC0415
+    from scanner.storage import replace_file  # noqa: PLC0415
+
+    rows, peaks, pitch, axis = _both(pmp, single)
+    fit = mcp_phase(rows, peaks, pitch, axis=axis)
+    if calibration is not None and output is not None:
+        content = {**load_calibration(calibration).as_dict(), "mcp_phase": fit.member}
+        content["id"] = content_id(content)
+        replace_file(output, as_text(content).encode())
+    ideal = {"slope": pitch, "intercept": pitch / 2 - 0.5}
+    if as_json:
+        print_json({**vars(fit), "ideal": ideal, "file": output and str(output)})
+    else:
+        facts: list[tuple[str, Any]] = [
+            ("line", f"row = {fit.slope:.5f} x stripe + {fit.intercept:.4f}"),
+            ("ideal", f"row = {ideal['slope']:.5f} x stripe + {ideal['intercept']:.4f}"),
+            ("deviation", f"{fit.deviation_px:.4f} rows at most"),
+            ("scatter", f"{fit.rms_px:.4f} rows rms"),
+            ("peaks", f"{fit.peaks:,} on {fit.stripes} stripes, {fit.outliers:,} outliers left out"),
+        ]
+        print_facts("code to phase", facts if output is None else [*facts, ("file", output)])
+    if fit.deviation_px > NOTABLE_PX:
+        print_error(
+            f"stripes and PMP rows differ by up to {fit.deviation_px:.2f} rows",
+            "correct the projector's gamma, focus it, and see that nothing moved between the scans",
+            label="warning",
+        )
+    return 0
+
+
+def _measured(
+    folder: Path, scan: Scan, *, flat: bool, sphere_mm: float | None, target: Any, length_mm: float | None
+) -> dict[str, Any]:
+    from scanner.calibration import verification  # noqa: PLC0415
+    from scanner.errors import DecodeError  # noqa: PLC0415
+
+    if scan.xyz is None:
+        raise DecodeError(f"{folder} has no points", hint="decode it with a calibration: fringed decode --calibration")
+    found: dict[str, Any] = {}
+    if flat:
+        found["flat"] = verification.plain(verification.flat_board(scan.xyz))
+    if sphere_mm is not None:
+        found["sphere"] = verification.plain(verification.sphere(scan.xyz, sphere_mm))
+    if target is not None:
+        found["length"] = verification.plain(verification.target_length(scan.albedo, scan.xyz, target, length_mm))
+    return found
+
+
+def _worst(document: dict[str, Any]) -> float:
+    """The largest of all errors, mm: flatness, form, size, length, repeatability."""
+    errors = [document["repeatability"]["depth_mm"]] if "repeatability" in document else []
+    for one in document["scans"]:
+        errors += [one["flat"]["flatness_mm"]] if "flat" in one else []
+        errors += [one["sphere"]["form_mm"], abs(one["sphere"]["size_mm"])] if "sphere" in one else []
+        errors += [abs(one["length"]["error_mm"])] if "length" in one else []
+    return float(max(errors))
+
+
+def _show(document: dict[str, Any]) -> None:
+    for kind in ("flat", "sphere", "length"):
+        rows = [(one["scan"], one[kind]) for one in document["scans"] if kind in one]
+        if not rows:
+            continue
+        names = [name for name, value in rows[0][1].items() if isinstance(value, int | float)]
+        cells = ([scan, *(_cell(values[name]) for name in names)] for scan, values in rows)
+        print_table(kind, ("scan", *(name.replace("_", " ") for name in names)), cells)
+    facts = [(name.replace("_", " "), _cell(value)) for name, value in document.get("repeatability", {}).items()]
+    print_facts("verification", [*facts, ("largest error", f"{document['largest_error_mm']:.4f} mm")])
+
+
+def _cell(value: float) -> str:
+    return f"{value:,}" if isinstance(value, int) else f"{value:.4f}"
+
+
+def _both(pmp: Path, single: Path) -> tuple[Any, Any, float, str]:
+    """PMP's map along MCP's axis, MCP's peaks, its pitch and axis."""
+    from scanner.capture import Capture  # noqa: PLC0415
+    from scanner.errors import DecodeError  # noqa: PLC0415
+    from scanner.patterns import McpPattern  # noqa: PLC0415
+    from scanner.scan import load_scan  # noqa: PLC0415
+
+    dense, stripes = load_scan(pmp), load_scan(single)
+    sequence = Capture.open(single / "capture").header.sequence
+    if stripes.peaks is None or not isinstance(sequence.pattern, McpPattern):
+        raise DecodeError(f"{single} is no MCP scan", hint="fringed scan --method mcp")
+    axis = sequence.pattern.axis
+    rows = dense.rows if axis == "y" else dense.columns
+    if rows is None:
+        raise DecodeError(
+            f"{pmp} was not projected along axis {axis}, as {single} was", hint=f"fringed scan --axis {axis}"
+        )
+    if rows.shape != stripes.shape:
+        raise DecodeError(f"{pmp} and {single} have pictures of different sizes")
+    return rows, stripes.peaks, sequence.pattern.pitch_px(sequence.projector), axis

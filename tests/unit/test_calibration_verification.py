@@ -1,0 +1,262 @@
+"""Features measured in made-up scans: flatness, a sphere, a length, repeatability, and MCP's line against PMP."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from scanner.calibration.mcp_phase import mcp_phase
+from scanner.calibration.targets import parse_target
+from scanner.calibration.verification import flat_board, local_point, repeatability, sphere, target_length
+from scanner.capture import CaptureHeader
+from scanner.errors import DecodeError
+from scanner.geometry import load_calibration
+from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
+from scanner.scan import Scan
+from service.cli import main
+
+HEIGHT, WIDTH = 120, 160
+
+
+def board(noise_mm: float = 0.0, bow_mm: float = 0.0, seed: int = 0) -> np.ndarray:
+    """(H, W, 3) mm: 160 x 120 mm, tilted by 20 degrees at 500 mm; noise along its normal."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    u, v = x - 79.5, y - 59.5
+    w = np.random.default_rng(seed).normal(0, noise_mm, u.shape) + bow_mm * (u**2 + v**2) / (80**2 + 60**2)
+    turn = np.asarray(cv2.Rodrigues(np.radians([0.0, 20.0, 0.0]))[0])
+    return np.stack((u, v, w), axis=-1) @ turn.T + np.array([0.0, 0.0, 500.0])
+
+
+def ball(radius: float = 25.0, noise_mm: float = 0.0) -> np.ndarray:
+    """(H, W, 3) mm: a sphere's near side before a wall, with pixels between that have nothing."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    u, v = 0.5 * (x - 79.5), 0.5 * (y - 59.5)
+    away = u**2 + v**2
+    r = radius + np.random.default_rng(1).normal(0, noise_mm, u.shape)
+    with np.errstate(invalid="ignore"):
+        z = np.where(away < (0.9 * radius) ** 2, 400 - np.sqrt(r**2 - away), 460.0)
+    points = np.stack((u, v, z), axis=-1)
+    points[(away > (0.9 * radius) ** 2) & (away < (1.1 * radius) ** 2)] = np.nan
+    return points
+
+
+def test_flat_board_is_as_flat_as_its_noise() -> None:
+    found = flat_board(board(noise_mm=0.05))
+    assert found.rms_mm == pytest.approx(0.05, rel=0.03)
+    # 99.7 % of a Gaussian lie within 5.94 sigma.
+    assert found.flatness_mm == pytest.approx(5.94 * 0.05, rel=0.05)
+    assert found.tilt_deg == pytest.approx(20, abs=0.01)
+    assert found.distance_mm == pytest.approx(500 * np.cos(np.radians(20)), abs=0.05)
+    assert abs(found.bow_mm) < 0.01
+    assert found.used > 0.999
+
+
+def test_bow_is_not_taken_for_noise() -> None:
+    found = flat_board(board(noise_mm=0.01, bow_mm=0.4))
+    assert abs(found.bow_mm) == pytest.approx(0.4, rel=0.05)
+    assert found.flatness_mm > 0.3
+
+
+def test_what_is_no_board_is_told_apart() -> None:
+    cloud = board(noise_mm=0.02)
+    cloud[:40, :60] += np.array([0.0, 0.0, -30.0])
+    cloud[100:] = np.nan
+    found = flat_board(cloud)
+    assert found.rms_mm == pytest.approx(0.02, rel=0.05)
+    assert found.used == pytest.approx(1 - 2400 / 16000, abs=0.001)
+    with pytest.raises(DecodeError, match="too few"):
+        flat_board(np.full((50, 50, 3), np.nan))
+
+
+def test_sphere_form_and_size() -> None:
+    found = sphere(ball(noise_mm=0.03), 50.0)
+    assert found.diameter_mm == pytest.approx(50.0, abs=0.02)
+    assert found.size_mm == pytest.approx(found.diameter_mm - 50.0)
+    assert found.rms_mm == pytest.approx(0.03, rel=0.05)
+    assert found.centre_mm == pytest.approx((0, 0, 400), abs=0.02)
+    assert 0.2 < found.used < 0.6
+    larger = sphere(ball(), 49.9)
+    assert larger.size_mm == pytest.approx(0.1, abs=0.002)
+    assert sphere(ball()[40:80, 60:100]).size_mm is None
+
+
+def test_sphere_of_another_size_is_not_found() -> None:
+    with pytest.raises(DecodeError, match="no sphere"):
+        sphere(board(), 20.0)
+
+
+def test_repeatability_is_the_noise_and_the_drift() -> None:
+    scans = [board(0.04, seed=k) for k in range(8)]
+    steep = np.cos(np.radians(20))
+    found = repeatability(scans)
+    # Noise along the board's normal: its depth part, less the three pixels in a thousand that vary most.
+    assert found.depth_mm == pytest.approx(0.04 * steep, rel=0.03)
+    assert found.drift_mm < 0.002
+    moved = repeatability([*scans, scans[0] + np.array([0.0, 0.0, 0.9])])
+    assert moved.drift_mm == pytest.approx(0.8, abs=0.01)
+    with pytest.raises(DecodeError, match="different sizes"):
+        repeatability([scans[0], scans[0][:50]])
+    with pytest.raises(DecodeError, match="point in every scan"):
+        repeatability([scans[0], np.full_like(scans[0], np.nan)])
+
+
+def test_point_between_pixels_is_on_the_surface() -> None:
+    cloud = board()
+    point = local_point(cloud, np.array([50.25, 40.75]))
+    assert point == pytest.approx(
+        0.25 * (0.75 * cloud[40, 50] + 0.25 * cloud[40, 51]) + 0.75 * (0.75 * cloud[41, 50] + 0.25 * cloud[41, 51])
+    )
+    assert local_point(cloud, np.array([2.0, 40.0])) is None
+    cloud[30:45] = np.nan
+    assert local_point(cloud, np.array([50.0, 40.0])) is None
+
+
+def scanned_target() -> tuple[np.ndarray, np.ndarray]:
+    """Albedo (H, W) of a chessboard of 12 mm squares, and its points at 4 px a mm, flat at 300 mm."""
+    y, x = np.mgrid[:440, :560]
+    squares = ((x - 40) // 48 + (y - 40) // 48) % 2 == 0
+    inside = (x >= 40) & (x < 520) & (y >= 40) & (y < 376)
+    albedo = cv2.GaussianBlur(np.where(inside & squares, 60.0, 200.0).astype(np.float32), (0, 0), 0.8)
+    return albedo, np.stack((x / 4, y / 4, np.full(x.shape, 300.0)), axis=-1)
+
+
+def test_length_between_the_ends_of_a_row() -> None:
+    albedo, xyz = scanned_target()
+    target = parse_target("chessboard:9x6:12")
+    assert target_length(albedo, xyz, target).error_mm == pytest.approx(0.0, abs=0.01)
+    assert target_length(albedo, 1.001 * xyz, target, 96.0).error_mm == pytest.approx(0.096, abs=0.01)
+    with pytest.raises(DecodeError, match="not found"):
+        target_length(albedo, xyz, parse_target("chessboard:7x4:12"))
+    xyz[:, :120] = np.nan
+    with pytest.raises(DecodeError, match="no scanned surface"):
+        target_length(albedo, xyz, target)
+
+
+# --- MCP ------------------------------------------------------------------------------------------------------------
+
+
+def stripes(slope: float, intercept: float, wrong: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A map of rows over a board, and peaks of 32 stripes in it that lie on a line, some with a wrong index."""
+    y, x = np.mgrid[:400, :300].astype(np.float64)
+    rows = 20 + 2.0 * y + 0.05 * x
+    generator = np.random.default_rng(4)
+    peaks = []
+    for index in range(32):
+        for column in range(0, 300, 10):
+            row = slope * index + intercept + generator.normal(0, 0.05)
+            at = (row - 20 - 0.05 * column) / 2
+            if 0 < at < 399:
+                peaks.append((column, at, row, index, 1.0))
+    table = np.array(peaks, dtype=np.float32)
+    if wrong:
+        table[:: len(table) // wrong, 3] += 3
+    half = table[:50].copy()
+    half[:, 3] += 0.5  # the minimum after a stripe: no stripe of its own
+    return rows.astype(np.float32), np.concatenate((table, half))
+
+
+def test_line_of_the_stripes_is_found() -> None:
+    rows, peaks = stripes(27.0, 13.0)
+    found = mcp_phase(rows, peaks, 27.0)
+    assert (found.slope, found.intercept) == pytest.approx((27.0, 13.0), abs=0.01)
+    assert found.deviation_px < 0.03
+    assert found.rms_px == pytest.approx(0.05, rel=0.1)
+    assert found.outliers < 5
+    off = mcp_phase(*stripes(27.02, 12.8), 27.0)
+    assert off.deviation_px == pytest.approx(0.42, abs=0.03)
+    assert off.member == {"slope": off.slope, "intercept": off.intercept}
+
+
+def test_wrong_codes_are_left_out() -> None:
+    rows, peaks = stripes(27.0, 13.0, wrong=60)
+    found = mcp_phase(rows, peaks, 27.0)
+    assert (found.slope, found.intercept) == pytest.approx((27.0, 13.0), abs=0.02)
+    assert 55 <= found.outliers <= 70
+
+
+def test_too_few_peaks_are_refused() -> None:
+    rows, peaks = stripes(27.0, 13.0)
+    with pytest.raises(DecodeError, match="stripe peaks lie on pixels"):
+        mcp_phase(np.full_like(rows, np.nan), peaks, 27.0)
+
+
+# --- commands -------------------------------------------------------------------------------------------------------
+
+
+def save(folder: Path, xyz: np.ndarray | None, albedo: np.ndarray | None = None, **maps: np.ndarray) -> Path:
+    shape = albedo.shape if albedo is not None else xyz.shape[:2] if xyz is not None else maps["rows"].shape
+    plain = np.full(shape, 120, np.float32)
+    scan = Scan(
+        rows=maps.get("rows", np.ones(shape, np.float32)),
+        columns=None,
+        sigma_rows=None,
+        sigma_columns=None,
+        sigma_z=None,
+        xyz=None if xyz is None else xyz.astype(np.float32),
+        confidence=np.ones(shape, np.float32),
+        albedo=plain if albedo is None else albedo,
+        modulation=plain,
+        reason=np.zeros(shape, np.uint8),
+        stripes=None,
+        peaks=maps.get("peaks"),
+        report={"format": "fringed-report", "version": 1},
+    )
+    folder.mkdir()
+    scan.save(folder)
+    return folder
+
+
+def test_verify_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    boards = [str(save(tmp_path / f"b{k}", board(0.02, seed=k))) for k in range(3)]
+    assert main(["calibrate", "verify", *boards, "--flat", "--repeat", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert len(document["scans"]) == 3
+    assert document["repeatability"]["scans"] == 3
+    assert document["largest_error_mm"] == pytest.approx(0.119, rel=0.1)
+    assert main(["calibrate", "verify", boards[0], "--flat", "--tolerance", "0.05"]) == 1
+    shown = capsys.readouterr()
+    assert "0.05 mm are allowed" in shown.err
+    assert "flatness mm" in shown.out
+    for words in ([], ["--length", "3"], ["--repeat"]):
+        assert main(["calibrate", "verify", boards[0], *words]) == 2
+    ball_folder = str(save(tmp_path / "ball", ball(noise_mm=0.01)))
+    assert main(["calibrate", "verify", ball_folder, "--sphere", "50", "--tolerance", "0.2"]) == 0
+    albedo, xyz = scanned_target()
+    row = str(save(tmp_path / "target", xyz, albedo.astype(np.float32)))
+    capsys.readouterr()
+    assert main(["calibrate", "verify", row, "--target", "chessboard:9x6:12", "--length", "95.5", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["scans"][0]["length"]["error_mm"] == pytest.approx(0.5, abs=0.02)
+    empty = str(save(tmp_path / "rows", None, np.full((40, 50), 9, np.float32)))
+    assert main(["calibrate", "verify", empty, "--flat"]) == 1
+    assert "has no points" in capsys.readouterr().err
+
+
+def test_mcp_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows, peaks = stripes(27.0, 13.0)
+    dense = str(save(tmp_path / "pmp", None, rows=rows))
+    single = save(tmp_path / "mcp", None, rows=rows, peaks=peaks)
+    sequence = PatternSequence(ProjectorSize(1152, 864), McpPattern(axis="y"))
+    header = CaptureHeader(sequence, CameraFormat(300, 400, 8), frames=("0.png",))
+    (single / "capture").mkdir()
+    (single / "capture" / "capture.json").write_text(json.dumps(header.as_dict()))
+    lens = {"size": [300, 400], "matrix": [[500, 0, 150], [0, 500, 200], [0, 0, 1]], "distortion": [0.0] * 5}
+    old, new = tmp_path / "rig.json", tmp_path / "new.json"
+    content = {"format": "fringed-calibration", "version": 1, "camera": lens, "projector": lens}
+    old.write_text(json.dumps({**content, "rotation": np.eye(3).tolist(), "translation": [0, 100, 0]}))
+    words = ["calibrate", "mcp", dense, str(single)]
+    assert main([*words, "--calibration", str(old), "-o", str(new), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["ideal"] == {"slope": 27.0, "intercept": 13.0}
+    assert document["slope"] == pytest.approx(27.0, abs=0.01)
+    written = load_calibration(new)
+    assert written.extra["mcp_phase"]["slope"] == document["slope"]
+    assert written.id
+    assert main([*words, "--calibration", str(old), "-o", str(new)]) == 2
+    assert main([*words, "-o", str(new)]) == 2
+    assert main(words) == 0
+    assert "row = 27.0" in capsys.readouterr().out
+    assert main(["calibrate", "mcp", dense, dense]) == 1
