@@ -53,7 +53,9 @@ def test_print_is_divided_out_and_the_maps_are_in_grey_levels():
         bright, dim = printed() > 0.5, printed() < 0.5
         ratio = np.median(decoded.albedo[good & bright]) / np.median(decoded.albedo[good & dim])
         assert ratio == pytest.approx(12, rel=0.1)
-        assert np.median(decoded.albedo[good & bright]) == pytest.approx(np.median(plain.albedo[good & bright]), rel=0.25)
+        assert np.median(decoded.albedo[good & bright]) == pytest.approx(
+            np.median(plain.albedo[good & bright]), rel=0.25
+        )
 
 
 def test_what_is_dark_in_the_white_frame_is_nothing_and_what_is_clipped_says_so():
