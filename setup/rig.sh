@@ -8,9 +8,11 @@
 #     setup/rig.sh boot CMD ARGS...     the same, with systemd as the first process
 #     setup/rig.sh build                build the image only
 #     setup/rig.sh possible             exit 0 if the rig can run here; else say why not
+#     setup/rig.sh if-possible          the tests, or a line that says why they are not run, and exit 0
 #
-# Output comes as it is made, and the exit status is the command's; 125 means that the guest itself failed.
-# RIG_TIMEOUT: seconds a guest may take, 1200 unless given. RIG_CPUS: its processors, 2 unless given.
+# Output comes as it is made, and the exit status is the command's; 125 means that the guest itself failed, 77 that
+# packages cannot be had. RIG_TIMEOUT: seconds a guest may take, 900 unless given. RIG_CPUS: its processors, 2 unless
+# given.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 clone=$PWD
@@ -19,6 +21,7 @@ box=tests/rig/box
 
 say() { printf 'rig: %s\n' "$*" >&2; }
 fail() { printf 'rig: %s\n' "$@" >&2; exit 125; }
+cannot() { printf 'rig: %s\n' "$@" >&2; exit 77; }
 words() { sed -e 's/#.*//' -e '/^[[:space:]]*$/d' "$1" | xargs; }
 
 missing_packages() {
@@ -40,9 +43,18 @@ obstacle() {
     [ -n "$missing" ] || return 0
     if [ "$(id -u)" != 0 ] && ! sudo -n true 2>/dev/null; then
         echo "packages are missing, and installing them takes root: apt-get install --no-install-recommends $missing"
-    elif ! apt-get install --simulate --no-install-recommends $missing >/dev/null 2>&1; then
-        echo "packages cannot be had here: $missing (apt-get update, or another mirror, may mend it)"
+    elif ! can_install $missing; then
+        echo "packages cannot be had here: $missing (another mirror in /etc/apt may mend it)"
     fi
+}
+
+# Lists may be absent or old: asked again after an update.
+can_install() {
+    local as_root=()
+    [ "$(id -u)" = 0 ] || as_root=(sudo)
+    apt-get install --simulate --no-install-recommends "$@" >/dev/null 2>&1 ||
+        { timeout 120 ${as_root[@]+"${as_root[@]}"} apt-get update -q >/dev/null 2>&1 &&
+            apt-get install --simulate --no-install-recommends "$@" >/dev/null 2>&1; }
 }
 
 install_packages() {
@@ -53,7 +65,7 @@ install_packages() {
     say "installing distribution packages: $missing"
     # shellcheck disable=SC2086  # a list of words
     ${as_root[@]+"${as_root[@]}"} env DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends $missing >&2 ||
-        fail "the packages could not be installed. Type, as root:" \
+        cannot "the packages could not be installed. Type, as root:" \
             "    apt-get update && apt-get install --no-install-recommends $missing" "then this command again."
 }
 
@@ -75,12 +87,12 @@ make_root() {
     mkdir "$work/debs"
     printf '#!/bin/sh\n%s' "$fetch_kernel" >"$work/fetch-kernel"
     chmod +x "$work/fetch-kernel"
-    timeout 900 mmdebstrap --quiet --variant=minbase --include="$include" \
+    timeout 600 mmdebstrap --quiet --variant=minbase --include="$include" \
         --dpkgopt='path-exclude=/usr/share/doc/*' --dpkgopt='path-exclude=/usr/share/man/*' \
         --dpkgopt='path-exclude=/usr/share/locale/*' \
         --customize-hook="$work/fetch-kernel" --customize-hook="sync-out /rig-kernel $work/debs" \
         --customize-hook='rm -rf "$1/rig-kernel"' \
-        bookworm "$work/root.tar" >&2 || fail "the guest's packages could not be had (see above)"
+        bookworm "$work/root.tar" >&2 || cannot "the guest's packages could not be had (see above)"
 }
 
 make_vkms() {
@@ -147,7 +159,7 @@ build() {
     flock 8
     [ "$(cat "$state/built" 2>/dev/null)" != "$stamp" ] || { exec 8>&-; return 0; }
     why=$(obstacle)
-    [ -z "$why" ] || fail "$why"
+    [ -z "$why" ] || cannot "$why"
     install_packages
     rm -rf "$state"/work.* "$state/built"
     work=$(mktemp -d "$state/work.XXXXXX")
@@ -173,16 +185,20 @@ compile_kernels() {
 # boot MODE CMD ARGS...
 boot() {
     local mode=$1 command status
+    local seconds=${RIG_TIMEOUT:-900}
     shift
     printf -v command '%q ' "$@"
     command=$(printf 'exec %s' "$command" | base64 -w 0)
     [ "${#command}" -lt 1600 ] || fail "the command is too long for the kernel's command line; put it into a script"
     run=$(mktemp -d "${TMPDIR:-/tmp}/rig.XXXXXX")
-    trap 'rm -rf "$run"' EXIT
+    qemu=
+    trap 'kill $qemu 2>/dev/null || true; rm -rf "$run"' EXIT
+    trap 'exit 125' INT TERM HUP
     mkfifo "$run/output" # not QEMU's stdio: a guest's port is shut when standard input ends
     cat "$run/output" &
+    local reader=$!
     # TMPDIR holds the guest's changes to its disk, which snapshot=on throws away.
-    TMPDIR=$run timeout --foreground --kill-after=10 "${RIG_TIMEOUT:-1200}" qemu-system-x86_64 \
+    TMPDIR=$run timeout --kill-after=10 "$seconds" qemu-system-x86_64 \
         -accel tcg,thread=multi -cpu max -smp "${RIG_CPUS:-2}" -m 2048 -nodefaults -no-user-config -display none -no-reboot \
         -kernel "$state/vmlinuz" -initrd "$state/initramfs" \
         -append "console=ttyS0 quiet panic=-1 mitigations=off rig.mode=$mode rig.share=$clone rig.command=$command" \
@@ -193,14 +209,24 @@ boot() {
         -device virtio-serial-pci \
         -chardev "file,id=output,path=$run/output" -device virtserialport,chardev=output,name=rig.output \
         -chardev "file,id=status,path=$run/status" -device virtserialport,chardev=status,name=rig.status \
-        </dev/null || true
-    wait $! || true
+        </dev/null &
+    qemu=$!
+    wait $qemu || true
+    qemu=
+    [ -e "$run/status" ] || kill $reader 2>/dev/null || true # QEMU did not start: nobody will write
+    wait $reader || true
     status=$(tr -dc 0-9 <"$run/status" 2>/dev/null || true)
     if [ -z "$status" ] || [ "$status" = 125 ]; then
         tail -n 40 "$run/console" >&2 || true
-        fail "the guest ended without a result (its console is above); RIG_TIMEOUT is ${RIG_TIMEOUT:-1200} s"
+        fail "the guest ended without a result (its console is above); RIG_TIMEOUT is $seconds s"
     fi
     return "$status"
+}
+
+tests() {
+    build
+    compile_kernels
+    boot fast "$clone/.venv/bin/python" -m pytest -q -p no:cacheprovider tests/rig tests/contract/test_window.py
 }
 
 case ${1:-tests} in
@@ -208,7 +234,11 @@ case ${1:-tests} in
     build) build ;;
     run) shift; build; boot fast "$@" ;;
     boot) shift; build; boot systemd "$@" ;;
-    tests) build; compile_kernels; boot fast "$clone/.venv/bin/python" -m pytest -q -p no:cacheprovider \
-        tests/rig tests/contract/test_window.py ;;
+    tests) tests ;;
+    if-possible)
+        status=0
+        setup/rig.sh tests || status=$?
+        [ $status != 77 ] || { say "tests/rig was not run, for the reason above"; status=0; }
+        exit $status ;;
     *) fail "no command '$1'; see the top of setup/rig.sh" ;;
 esac
