@@ -350,17 +350,19 @@ def widen_reasons(around: NDArray[np.uint8], rows: Array, reason: NDArray[np.uin
         rows: (H, W) float32, NaN where there is none.
         reason: (H, W) uint8, set in place. The last column takes what is left over at the right.
     """
-    _widen_reasons(around, rows, reason)
+    _widen_reasons(np.ascontiguousarray(around.T), rows, reason)
 
 
 @kernel
 def _widen_reasons(around: NDArray[np.uint8], rows: Array, reason: NDArray[np.uint8]) -> None:
-    columns = around.shape[0]
-    height, width = rows.shape
-    block = 16
-    for y0 in range(0, height, block):
+    height, columns = around.shape
+    width = rows.shape[1]
+    for y in range(height):
+        line, out = rows[y], reason[y]
         for b in range(columns):
-            last = width if b == columns - 1 else 4 * b + 4
-            for y in range(y0, min(y0 + block, height)):
-                for x in range(4 * b, last):
-                    reason[y, x] = around[b, y] if np.isnan(rows[y, x]) else np.uint8(0)
+            value = around[y, b]
+            for j in range(4):
+                row = line[4 * b + j]
+                out[4 * b + j] = value * np.uint8(row != row)  # noqa: PLR0124  (NaN alone differs from itself)
+        for x in range(4 * columns, width):
+            out[x] = around[y, columns - 1] * np.uint8(line[x] != line[x])
