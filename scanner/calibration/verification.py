@@ -119,7 +119,8 @@ def sphere(xyz: NDArray[Any], diameter_mm: float | None = None) -> Probing:
         DecodeError: too few points, or nothing round of that size among them.
     """
     points = _finite(xyz)
-    used = _belonging(points, _sphere_distance(diameter_mm), 4)
+    reach = 0.7 * diameter_mm if diameter_mm is not None else 0.3 * float(np.ptp(points, axis=0).max())
+    used = _belonging(points, _sphere_distance(diameter_mm), 4, reach)
     if used.sum() < FEWEST_POINTS:
         raise DecodeError(f"no sphere among the points: {int(used.sum())} lie on the best one")
     on = points[used]
@@ -237,14 +238,20 @@ def _spread(off: Array) -> float:
     return float(spans.min())
 
 
-def _belonging(points: Array, distances: Any, needed: int) -> NDArray[np.bool_]:
-    """Points of the feature that most points are near to: the best of random ones, then gross ones out."""
+def _belonging(points: Array, distances: Any, needed: int, reach: float = np.inf) -> NDArray[np.bool_]:
+    """Points of the feature that most points are near to: the best of random ones, then gross ones out.
+
+    Random ones are drawn within `reach` of each other: a ball is a small part of the wall it stands before.
+    """
     generator = np.random.default_rng(2634)
     sample = points if len(points) <= SAMPLE else generator.choice(points, SAMPLE, replace=False)
     best, threshold = None, 0.01 * float(np.ptp(sample, axis=0).max())
     most = -1
     for _ in range(DRAWS):
-        off = distances(generator.choice(sample, needed, replace=False), sample)
+        near = sample
+        if np.isfinite(reach):
+            near = sample[np.linalg.norm(sample - sample[generator.integers(len(sample))], axis=1) < reach]
+        off = distances(generator.choice(near, needed, replace=False), sample) if len(near) >= needed else None
         if off is None:
             continue
         count = int((np.abs(off) < threshold).sum())

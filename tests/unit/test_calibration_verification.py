@@ -84,6 +84,12 @@ def test_sphere_form_and_size() -> None:
     assert sphere(ball()[40:80, 60:100]).size_mm is None
 
 
+def test_small_sphere_before_a_wide_wall() -> None:
+    found = sphere(ball(radius=12.0, noise_mm=0.01), 24.0)
+    assert found.used < 0.1
+    assert found.size_mm == pytest.approx(0.0, abs=0.02)
+
+
 def test_sphere_of_another_size_is_not_found() -> None:
     with pytest.raises(DecodeError, match="no sphere"):
         sphere(board(), 20.0)
