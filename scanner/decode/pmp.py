@@ -103,6 +103,8 @@ class PmpDecoder:
                 self._decode(axis)
         for axis, found in self._found.items():
             warnings += disagreements(axis, found.remainders)
+            if found.ripple is not None and (ripple := found.ripple.warning(axis)) is not None:
+                warnings += (ripple,)
         warnings += self._found[self._pattern.axes[0]].ladder.warnings()
         return self._decoded(warnings)
 
@@ -184,6 +186,7 @@ class PmpDecoder:
                     "combinations": found.ladder.combinations.tolist(),
                     "remainders": [asdict(r) for r in found.remainders],
                     "settled_by_neighbours": found.settled,
+                    "ripple": None if found.ripple is None else asdict(found.ripple),
                 }
                 for axis, found in self._found.items()
             },

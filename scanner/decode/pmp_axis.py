@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scanner.decode import Map, Reason
 from scanner.decode.addresses import aligned_rows
-from scanner.decode.agreement import Remainder
+from scanner.decode.agreement import MIN_PIXELS, Remainder
 from scanner.decode.neighbours import settle
 from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel
 from scanner.decode.pmp_frames import AxisFrames
@@ -94,6 +94,32 @@ class AxisMaps:
         return counts
 
 
+LEAST_RIPPLE_CYCLES = 0.003
+"""Systematic disagreement of the finest set that is worth a word: three times what 8-bit projection leaves."""
+
+
+@dataclass(frozen=True)
+class Ripple:
+    """What the finest set's phases have in error that is no noise: response, interreflection, flicker."""
+
+    cycles: float
+    """1-sigma, cycles of the finest set"""
+    px: float
+    """the same in projector px"""
+    random_px: float
+    """median random 1-sigma of a coordinate, projector px"""
+
+    def warning(self, axis: str) -> str | None:
+        """What a user should know, where the ripple outweighs noise."""
+        if self.cycles < LEAST_RIPPLE_CYCLES or not self.px > self.random_px:
+            return None
+        return (
+            f"ripple along {axis}: frequencies differ by {self.px:.2f} projector px more than noise explains "
+            f"(noise is {self.random_px:.2f} px): measure the response (fringed calibrate response), "
+            "take more shifts, or look for light that surfaces throw at one another"
+        )
+
+
 @dataclass(frozen=True)
 class AxisFound:
     """What one axis's decoding found beside its maps."""
@@ -103,6 +129,8 @@ class AxisFound:
     noise: NoiseModel
     remainders: list[Remainder]
     settled: int
+    ripple: Ripple | None
+    """None with one frequency, which has nothing to differ from"""
     counts: NDArray[np.int64]
     """(REASONS,) pixels by reason"""
 
@@ -130,6 +158,11 @@ def decode_axis(
     least = max(t.min_modulation_levels, t.min_modulation_share * sample.brightest(finest))
     noise = sample.noise(ladder, centre, least, t.min_modulation_sigmas)
     remainders = sample.agreement(ladder, noise, centre, least, t.min_modulation_sigmas, t.phase_floor_cycles)
+    per_cycle = along / float(ladder.frequencies[-1])
+    random_px = per_cycle * sample.phase_sigma(noise, finest, least, t.min_modulation_sigmas)
+    ripple = None
+    if remainders and remainders[-1].pixels >= MIN_PIXELS:
+        ripple = _ripple(remainders[-1], float((ladder.errors[-1] ** 2).sum()), per_cycle, random_px)
     f32 = partial(np.array, dtype=np.float32)
     errors2 = ladder.errors**2
     systematic = np.array([r.systematic for r in remainders], dtype=np.float64)
@@ -157,7 +190,14 @@ def decode_axis(
         settled = settle(maps.position, maps.sigma, maps.confidence, maps.reason, camera.width, per_px)
         counts[Reason.UNWRAP_RISK] -= settled
         counts[Reason.VALUE] += settled
-    return AxisFound(maps, ladder, noise, remainders, settled, counts)
+    return AxisFound(maps, ladder, noise, remainders, settled, ripple, counts)
+
+
+def _ripple(last: Remainder, weight: float, per_cycle: float, random_px: float) -> Ripple:
+    # Spread of angles from the length of their mean vector (Mardia 1972, 3.4): all of the image, not its better part.
+    spread2 = -2 * np.log(max(last.agreement, 1e-6)) / (2 * np.pi) ** 2
+    cycles = float(np.sqrt(max(spread2 - last.expected_sigma**2, 0.0) / weight))
+    return Ripple(cycles, per_cycle * cycles, random_px)
 
 
 def finest_of(pattern: PmpPattern) -> int:

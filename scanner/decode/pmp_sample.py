@@ -78,6 +78,12 @@ class Sample:
         cycles2 = self._noise_of_b2(noise)[:, good] / (self.modulations[:, good] ** 2 * np.float32(4 * np.pi**2))
         return agreement(ladder, self.phases[:, good], cycles2, centre, floor_cycles)
 
+    def phase_sigma(self, noise: NoiseModel, finest: int, least: float, sigmas: float) -> float:
+        """Random 1-sigma of the finest set's phase, cycles, median of usable pixels; NaN without any."""
+        good = self._good(noise, least, sigmas)
+        cycles2 = self._noise_of_b2(noise)[finest][good] / (self.modulations[finest][good] ** 2 * 4 * np.pi**2)
+        return float(np.sqrt(np.median(cycles2))) if cycles2.size else float("nan")
+
     def _good(self, noise: NoiseModel, least: float, sigmas: float) -> NDArray[np.bool_]:
         enough = np.maximum(np.float32(sigmas**2) * self._noise_of_b2(noise), np.float32(max(least**2, 1e-12)))
         return np.asarray((self.modulations**2 > enough).all(axis=0) & self.usable)

@@ -424,6 +424,25 @@ def test_kernels_compile_before_they_are_needed():
     warm_up()
 
 
+@pytest.mark.parametrize(("shifts", "exponent", "warned"), [(3, 1.3, True), (3, 1.0, False), (8, 1.3, False)])
+def test_a_ripple_has_a_name_and_a_number(shifts, exponent, warned):
+    pattern = PmpPattern(("y",), (1.0, 8.0, 32.0), (shifts,) * 3)
+    camera = CameraFormat(400, 300)
+    shape = surface(camera)
+    frames = [
+        np.rint(255 * (frame / 255.0) ** exponent).astype(np.uint8)
+        for frame in render(pattern, camera, 0.5, 0.9, shape=shape)
+    ]
+    decoded = decode(pattern, frames, camera)
+    ripple = decoded.details["unwrapping"]["y"]["ripple"]
+    assert any("ripple along y" in warning for warning in decoded.warnings) == warned
+    if warned:
+        error = np.sqrt(np.nanmean((decoded.rows - shape[0]) ** 2))
+        assert 0.5 * error < ripple["px"] < 2 * error
+    else:
+        assert ripple["px"] < 0.05
+
+
 # --- one pass over all frames -------------------------------------------------------------------------------------
 
 
