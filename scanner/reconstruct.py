@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from scanner.capture import Capture, CaptureHeader
+from scanner.carrier_check import require_carriers
 from scanner.compare import compare
 from scanner.decode import Decoded, Decoder, Reason, decoder_for
 from scanner.decode.repeated import Repetitions
@@ -132,7 +133,7 @@ class Reconstruction:
         if len(self._header.sequence) > 1:
             # The witnesses have seen light: without it the check ends in an error of its own.
             raise_if_empty(decoded)
-        decoded = self._oriented(decoded)
+        decoded = self._carriers_fit(self._oriented(decoded), capture)
         tell("triangulating")
         scan = build_scan(decoded, self._calibration, self._options.filters, timings=self._timings)
         scan = scan.with_report(sync=check.as_dict(), capture=self._capture_report(capture))
@@ -175,6 +176,23 @@ class Reconstruction:
             if values is not None and (warning := require_orientation(self._calibration, values, axis)) is not None
         ]
         return replace(decoded, warnings=(*decoded.warnings, *said)) if said else decoded
+
+    def _carriers_fit(self, decoded: Decoded, capture: Capture) -> Decoded:
+        """MCP on a calibrated rig: the carriers' frequencies agree with the stripes' names; see `carrier_check`."""
+        sequence = self._header.sequence
+        values = decoded.rows if decoded.columns is None else decoded.columns
+        if self._calibration is None or not isinstance(sequence.pattern, McpPattern) or values is None:
+            return decoded
+        position = next((p for p in sequence.fringes if p in capture.records), None)
+        if position is None:
+            return decoded
+        with self._timed("check carriers"):
+            fit, warning = require_carriers(
+                self._calibration, sequence.pattern, sequence.projector, capture.frame(position), values
+            )
+        details = {**decoded.details, "carrier_check": None if fit is None else fit.as_dict()}
+        said = () if warning is None else (warning,)
+        return replace(decoded, details=details, warnings=(*decoded.warnings, *said))
 
     def _catch_up(self, capture: Capture) -> None:
         present = {pattern: record.slot for pattern, record in capture.records.items()}

@@ -1,0 +1,242 @@
+"""Do the carriers along MCP's stripes run as decoded stripes and calibration say? A check on a whole scan.
+
+A stripe's name gives its pixels a depth, the depth a projector coordinate along the stripe, and that coordinate the
+phase of every carrier there. A description whose order of codes, first stripe or carriers is not the projected one
+fits many images and decodes without a residual; its depths are wrong by whole stripes, and the carriers' frequencies
+are not where they put them: by tenths of a per cent where all stripes are wrong alike, anywhere where names are mixed
+up. Each stretch of stripe is asked at which frequency, relative to the predicted one, its carriers are strongest.
+Nothing here needs the phase itself, so a calibration may be off by pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.errors import DecodeError
+from scanner.geometry import Array, Calibration
+from scanner.patterns import McpPattern, ProjectorSize
+from scanner.triangulation import triangulate
+
+STRETCH_PX = 256
+"""Camera pixels of a stretch: 25 to 50 cycles, which resolve 2 to 4 per cent of frequency and a tenth of it in noise"""
+
+LEAST_PX = 96
+"""Shorter stretches, at silhouettes, resolve too little."""
+
+OFFSETS = np.arange(-0.12, 0.1201, 0.005)
+"""Frequencies tried, relative to the predicted one"""
+
+NEAR = 0.02
+"""A right stretch is strongest this near the prediction: half its resolution, and what a surface may bend"""
+
+LEAST_CORRELATION = 0.25
+"""Of a stretch's light with the best wave: less is no carrier (noise of n pixels reaches 3 / sqrt(n))"""
+
+LEAST_STRETCHES = 20
+MOST_CONTRADICTING = 0.3
+NOTICEABLE = 0.1
+"""Sound scans stay at a hundredth or two; carriers that change places leave four to five tenths."""
+
+SURELY = 0.2
+"""All stripes are this near to a whole number of stripes further on where the description is to blame; sound scans
+stay within .05 of none. A calibration that is off (a tenth of a per cent of focal length does as much as half a
+stripe) lands anywhere."""
+
+UNSURE = 0.3
+"""Further from none than this, it is said"""
+
+
+@dataclass(frozen=True)
+class CarrierFit:
+    """What the stretches said."""
+
+    expected: int
+    """carriers that stretches should have by their names"""
+    stretches: int
+    """of these, those that were strong enough to be asked"""
+    contradicting: float
+    """share of them whose frequency is not the predicted one"""
+    offset: float
+    """median of their frequencies relative to the predicted ones"""
+    per_stripe: float
+    """what the offset would be if all stripes were one further on"""
+
+    @property
+    def stripes(self) -> float:
+        """By how many stripes all together seem to be wrong."""
+        return self.offset / self.per_stripe if self.per_stripe else 0.0
+
+    def as_dict(self) -> dict[str, float]:
+        """For report.json."""
+        return {
+            "stretches": self.stretches,
+            "contradicting": self.contradicting,
+            "offset": self.offset,
+            "stripes": self.stripes,
+        }
+
+
+def require_carriers(
+    calibration: Calibration,
+    pattern: McpPattern,
+    projector: ProjectorSize,
+    frame: NDArray[np.uint8] | NDArray[np.uint16],
+    values: NDArray[np.float32],
+) -> tuple[CarrierFit | None, str | None]:
+    """Check one decoded scan.
+
+    Args:
+        frame: (H, W) the pattern's frame.
+        values: (H, W) float32 decoded rows (axis "y") or columns ("x"), px, NaN where there is none.
+
+    Returns:
+        What was found (None: too few stretches to say), and a warning if a noticeable part contradicts.
+
+    Raises:
+        DecodeError: most of it does.
+    """
+    fit = fit_carriers(calibration, pattern, projector, frame, values)
+    if fit is None:
+        return None, None
+    if fit.contradicting > MOST_CONTRADICTING:
+        raise DecodeError(
+            f"{_said(fit)}: the pattern description or the calibration contradicts the frame",
+            hint='check the description\'s "codes" and order of "carriers", and that the calibration is this rig\'s',
+        )
+    if fit.contradicting > NOTICEABLE:
+        return fit, f"{_said(fit)}: wrong stripes, or a calibration that is not this rig's any more"
+    whole = round(fit.stripes)
+    if whole and abs(fit.stripes - whole) < SURELY:
+        raise DecodeError(
+            f"the carriers fit the calibration if every stripe is {abs(whole)} {'further on' if whole > 0 else 'back'} "
+            f"({fit.stripes:+.2f}): the pattern description is not what was projected",
+            hint='check the description\'s "first" and where its "codes" begin',
+        )
+    if abs(fit.stripes) > UNSURE:
+        return fit, (
+            f"all carriers are {fit.offset:+.2%} off, as if every stripe were {fit.stripes:+.1f} from the one decoded: "
+            "the calibration is not this rig's any more, or not good to a tenth of a per cent"
+        )
+    return fit, None
+
+
+def _said(fit: CarrierFit) -> str:
+    return f"along {fit.contradicting:.0%} of the stripes the carriers are not as stripes and calibration put them"
+
+
+def fit_carriers(
+    calibration: Calibration,
+    pattern: McpPattern,
+    projector: ProjectorSize,
+    frame: NDArray[np.uint8] | NDArray[np.uint16],
+    values: NDArray[np.float32],
+) -> CarrierFit | None:
+    """See `require_carriers`; raises nothing."""
+    along_rows = pattern.axis == "y"
+    lines = values if along_rows else values.T
+    light = (frame if along_rows else frame.T).astype(np.float32)
+    stripe, y, x = _stripe_pixels(pattern, projector, lines)
+    if stripe.size < LEAST_PX * LEAST_STRETCHES:
+        return None
+    crossing = _along_stripe(calibration, pattern, values, y, x)
+    pitch = np.float32(pattern.pitch_px(projector))
+    further = _along_stripe(calibration, pattern, values + pitch, y, x)
+    use = np.isfinite(crossing) & np.isfinite(further)
+    stripe, y, x, crossing, further = stripe[use], y[use], x[use], crossing[use], further[use]
+    stretch = stripe * (1 + lines.shape[1] // STRETCH_PX) + x // STRETCH_PX
+    _, stretch, length = np.unique(stretch, return_inverse=True, return_counts=True)
+    alternating = _alternating(light[y, x], stretch, length)
+    cycles = crossing / projector.along("x" if along_rows else "y")
+    found = [
+        _best_offsets(alternating, cycles * carrier, stretch, length, _has_carrier(pattern, stripe, bit))
+        for bit, carrier in enumerate(pattern.carriers)
+    ]
+    offsets = np.concatenate([offsets for offsets, _ in found])
+    expected = sum(count for _, count in found)
+    if offsets.size < LEAST_STRETCHES:
+        return None if expected < 2 * LEAST_STRETCHES else CarrierFit(expected, int(offsets.size), 1.0, 0.0, 0.0)
+    per_stripe = -_relative_slope(further, crossing, stretch, length)
+    return CarrierFit(
+        expected, int(offsets.size), float(np.mean(np.abs(offsets) > NEAR)), float(np.median(offsets)), per_stripe
+    )
+
+
+def _relative_slope(other: Array, crossing: Array, stretch: NDArray[np.intp], length: NDArray[np.intp]) -> float:
+    """Median over stretches of how much faster `other` runs than `crossing`, relative."""
+    count = len(length)
+    centred = crossing - (np.bincount(stretch, crossing) / length)[stretch]
+    square = np.bincount(stretch, centred * centred, count)
+    slope = np.bincount(stretch, other * centred, count) / np.maximum(square, 1e-9)
+    return float(np.median(slope[length >= LEAST_PX]) - 1) if (length >= LEAST_PX).any() else 0.0
+
+
+def _stripe_pixels(
+    pattern: McpPattern, projector: ProjectorSize, lines: NDArray[np.float32]
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Pixels nearest to the middle of a modulated stripe with carriers: stripe, y, x, stripes running along x."""
+    pitch = pattern.pitch_px(projector)
+    steps = np.abs(np.diff(lines, axis=0, prepend=np.nan))
+    half = np.nanmedian(steps) / 2 if np.isfinite(steps).any() else 0.5
+    position = (lines + 0.5) / pitch
+    number = np.floor(position)
+    middle = np.abs(position - number - 0.5) * pitch <= half
+    y, x = np.nonzero(middle)
+    stripe = number[y, x].astype(np.intp)
+    coded = np.array([bool(pattern.code_of(s)) for s in range(pattern.stripe_count)])
+    use = (stripe >= 0) & (stripe < pattern.stripe_count)
+    use[use] = coded[stripe[use]]
+    return stripe[use], y[use], x[use]
+
+
+def _along_stripe(
+    calibration: Calibration, pattern: McpPattern, values: NDArray[np.float32], y: NDArray[np.intp], x: NDArray[np.intp]
+) -> Array:
+    """Projector coordinate along the stripe, px, at these pixels, by way of their depth."""
+    sparse = np.full_like(values, np.nan)
+    at = (y, x) if pattern.axis == "y" else (x, y)
+    sparse[at] = values[at]
+    xyz = triangulate(calibration, **{"rows" if pattern.axis == "y" else "columns": sparse}).xyz[at]
+    seen = calibration.projector.project(calibration.to_projector(xyz))
+    found: Array = seen[:, 0 if pattern.axis == "y" else 1]
+    return found
+
+
+def _alternating(light: NDArray[np.float32], stretch: NDArray[np.intp], length: NDArray[np.intp]) -> Array:
+    """Light without its mean over the stretch, of unit power; 0 in stretches without any."""
+    centred: Array = light - (np.bincount(stretch, light) / length)[stretch]
+    power = np.sqrt(np.bincount(stretch, centred * centred))
+    return centred / np.maximum(power, 1e-6)[stretch]
+
+
+def _has_carrier(pattern: McpPattern, stripe: NDArray[np.intp], bit: int) -> NDArray[np.bool_]:
+    has = np.array([bool((pattern.code_of(s) or 0) >> bit & 1) for s in range(pattern.stripe_count)])
+    return has[stripe]
+
+
+def _best_offsets(
+    alternating: Array, cycles: Array, stretch: NDArray[np.intp], length: NDArray[np.intp], use: NDArray[np.bool_]
+) -> tuple[Array, int]:
+    """Relative frequency at which each stretch is strongest, of those strong enough; how many are long enough."""
+    count = len(length)
+    light, phase, where = alternating[use], cycles[use], stretch[use]
+    # About the stretch's own middle: there the phase does not turn with the offset.
+    middle = np.bincount(where, phase, count) / np.maximum(np.bincount(where, minlength=count), 1)
+    centred = phase - middle[where]
+    strength = np.empty((len(OFFSETS), count))
+    for i, offset in enumerate(OFFSETS):
+        wave = light * np.exp(-2j * np.pi * (phase + offset * centred))
+        strength[i] = np.hypot(np.bincount(where, wave.real, count), np.bincount(where, wave.imag, count))
+    # A wave of unit power over n pixels has amplitude sqrt(2 / n): correlation is strength over sqrt(n / 2).
+    n = np.bincount(where, minlength=count)
+    correlation = strength.max(axis=0) / np.sqrt(np.maximum(n, 1) / 2)
+    asked = (n >= LEAST_PX) & (correlation > LEAST_CORRELATION)
+    # The maximum of a parabola through the three strongest: a tenth of the grid's step.
+    best = np.clip(strength.argmax(axis=0), 1, len(OFFSETS) - 2)
+    below, at, above = (strength[best + step, np.arange(count)] for step in (-1, 0, 1))
+    curvature = below - 2 * at + above
+    shift = np.where(curvature < 0, (below - above) / (2 * np.where(curvature < 0, curvature, -1)), 0.0)
+    strongest: Array = (OFFSETS[best] + np.clip(shift, -1, 1) * (OFFSETS[1] - OFFSETS[0]))[asked]
+    return strongest, int(np.count_nonzero(n >= LEAST_PX))
