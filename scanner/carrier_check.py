@@ -35,7 +35,11 @@ NEAR = 0.02
 LEAST_CORRELATION = 0.25
 """Of a stretch's light with the best wave: less is no carrier (noise of n pixels reaches 3 / sqrt(n))"""
 
-LEAST_STRETCHES = 20
+LEAST_STRETCHES = 16
+
+LEAST_PRESENT = 0.5
+"""Share of the expected carriers that must be there at all: nine in ten are, on strong texture too"""
+
 MOST_CONTRADICTING = 0.3
 NOTICEABLE = 0.1
 """Sound scans stay at a hundredth or two; carriers that change places leave four to five tenths."""
@@ -44,6 +48,9 @@ SURELY = 0.2
 """All stripes are this near to a whole number of stripes further on where the description is to blame; sound scans
 stay within .05 of none. A calibration that is off (a tenth of a per cent of focal length does as much as half a
 stripe) lands anywhere."""
+
+MOST_SIGMA = 0.15
+"""1-sigma of that number, in stripes, up to which it is believed: none is then five sigmas away"""
 
 UNSURE = 0.3
 """Further from none than this, it is said"""
@@ -63,11 +70,18 @@ class CarrierFit:
     """median of their frequencies relative to the predicted ones"""
     per_stripe: float
     """what the offset would be if all stripes were one further on"""
+    sigma: float = 0.0
+    """1-sigma of the median, relative frequency"""
 
     @property
     def stripes(self) -> float:
         """By how many stripes all together seem to be wrong."""
         return self.offset / self.per_stripe if self.per_stripe else 0.0
+
+    @property
+    def sigma_stripes(self) -> float:
+        """1-sigma of `stripes`."""
+        return self.sigma / abs(self.per_stripe) if self.per_stripe else 0.0
 
     def as_dict(self) -> dict[str, float]:
         """For report.json."""
@@ -76,6 +90,7 @@ class CarrierFit:
             "contradicting": self.contradicting,
             "offset": self.offset,
             "stripes": self.stripes,
+            "sigma_stripes": self.sigma_stripes,
         }
 
 
@@ -109,13 +124,13 @@ def require_carriers(
     if fit.contradicting > NOTICEABLE:
         return fit, f"{_said(fit)}: wrong stripes, or a calibration that is not this rig's any more"
     whole = round(fit.stripes)
-    if whole and abs(fit.stripes - whole) < SURELY:
+    if whole and abs(fit.stripes - whole) < SURELY and fit.sigma_stripes < MOST_SIGMA:
         raise DecodeError(
             f"the carriers fit the calibration if every stripe is {abs(whole)} {'further on' if whole > 0 else 'back'} "
             f"({fit.stripes:+.2f}): the pattern description is not what was projected",
             hint='check the description\'s "first" and where its "codes" begin',
         )
-    if abs(fit.stripes) > UNSURE:
+    if abs(fit.stripes) > UNSURE + 3 * fit.sigma_stripes:
         return fit, (
             f"all carriers are {fit.offset:+.2%} off, as if every stripe were {fit.stripes:+.1f} from the one decoded: "
             "the calibration is not this rig's any more, or not good to a tenth of a per cent"
@@ -156,12 +171,16 @@ def fit_carriers(
     ]
     offsets = np.concatenate([offsets for offsets, _ in found])
     expected = sum(count for _, count in found)
-    if offsets.size < LEAST_STRETCHES:
-        return None if expected < 2 * LEAST_STRETCHES else CarrierFit(expected, int(offsets.size), 1.0, 0.0, 0.0)
+    if expected < LEAST_STRETCHES:
+        return None
+    if offsets.size < LEAST_PRESENT * expected:
+        return CarrierFit(expected, int(offsets.size), 1.0, 0.0, 0.0)
     per_stripe = -_relative_slope(further, crossing, stretch, length)
-    return CarrierFit(
-        expected, int(offsets.size), float(np.mean(np.abs(offsets) > NEAR)), float(np.median(offsets)), per_stripe
-    )
+    middle = float(np.median(offsets))
+    # A median's sigma is 1.25 that of a mean, and a Gaussian's sigma 1.48 times its median deviation.
+    sigma = 1.25 * 1.48 * float(np.median(np.abs(offsets - middle))) / np.sqrt(offsets.size)
+    contradicting = float(np.mean(np.abs(offsets) > NEAR))
+    return CarrierFit(expected, int(offsets.size), contradicting, middle, per_stripe, float(sigma))
 
 
 def _relative_slope(other: Array, crossing: Array, stretch: NDArray[np.intp], length: NDArray[np.intp]) -> float:
