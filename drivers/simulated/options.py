@@ -36,6 +36,9 @@ class WorldOptions:
 
     seed: int = field(default=0, metadata={"low": 0, "high": 2**31 - 1})
     """of noise, jitter, phases, and of the poses of printed targets"""
+    walk: bool = False
+    """a printed target goes to its next pose once a sequence was shown and the projector is given other images: as a
+    preview does between scans"""
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,9 @@ PERIODS_PER_REFRESH = 4
 STAMP_BOUND_NS = 1000
 """Flip stamps are true to this"""
 
+LEAST_SEQUENCE = 9
+"""Different images from which a run counts as a sequence, and not as test shots of flat images"""
+
 _OUTPUTS: dict[str, frozenset[Literal["frame", "exposure"]]] = {
     "none": frozenset(),
     "frame": frozenset({"frame"}),
@@ -105,6 +108,8 @@ class SimulatedProjector:
                 )
         if self._capabilities.kind is ProjectorKind.STATIC and len(images) > 1:
             raise DeviceError(f"a static projector holds one image, got {len(images)}", device=self._name)
+        if len(set(self._shown)) >= LEAST_SEQUENCE:
+            self._world.sequence_over()
         self._images = [LoadedImage(np.asarray(image)) for image in images]
         self._shown = []
         self._delay = 0

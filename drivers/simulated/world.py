@@ -35,6 +35,9 @@ NOMINAL_EXPOSURE_NS = 33_333_333
 
 WHITE = 230 / 255
 
+POSES = 12
+"""Of a printed target; after the last comes the first."""
+
 PULSE_BANDS = 64
 """A rolling exposure that cuts pulses is taken in so many bands of rows."""
 
@@ -73,6 +76,7 @@ class World:
         """the wires between the devices, put there by whoever drives them"""
         self._large: deque[LoadedImage] = deque(maxlen=LARGE_LIGHTS)
         self._holders: dict[str, weakref.ref[Any]] = {}
+        self._steps = 0
         values = np.arange(256) / 255.0
         self._response: Plane = (values**settings.optics.gamma).astype(np.float32)
 
@@ -107,7 +111,16 @@ class World:
         s = self.settings
         seed = s.shared.seed if s.scene in POSED else 0
         o = s.optics
-        return _view(s.rig, s.scene, s.scene_options, seed, o.projector_falloff, o.vignetting, o.ambient)
+        options = s.scene_options
+        if self._steps:
+            options = replace(options, pose=(options.pose + self._steps) % POSES)
+        return _view(s.rig, s.scene, options, seed, o.projector_falloff, o.vignetting, o.ambient)
+
+    def sequence_over(self) -> None:
+        """A sequence was shown and will not be shown again: a target that walks goes to its next pose."""
+        if self.settings.shared.walk and self.settings.scene in POSED:
+            self._steps += 1
+            self.__dict__.pop("view", None)
 
     @cached_property
     def electrons_per_light(self) -> float:
