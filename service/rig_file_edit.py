@@ -6,6 +6,7 @@ keys, values over several lines) is left to its owner, in words.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,8 +16,8 @@ from scanner.storage import replace_file
 from service.config import check_rig
 
 
-def set_values(path: Path, table: str, values: Mapping[str, Sequence[int]]) -> Path:
-    """Set integer pairs in `[table]`, each on a line of its own; returns the copy of what was before.
+def set_values(path: Path, table: str, values: Mapping[str, Sequence[int] | str]) -> Path:
+    """Set integer pairs and texts in `[table]`, each on a line of its own; returns the copy of what was before.
 
     Raises:
         ConfigError: the table has no header of its own, or the file would not be a rig file any more.
@@ -32,7 +33,7 @@ def set_values(path: Path, table: str, values: Mapping[str, Sequence[int]]) -> P
         )
     end = next((i for i in range(begin + 1, len(lines)) if lines[i].lstrip().startswith("[")), len(lines))
     for key, value in reversed(list(values.items())):
-        new = f"{key} = [{', '.join(map(str, value))}]"
+        new = f"{key} = {_written(value)}"
         place = next((i for i in range(begin + 1, end) if re.match(rf"\s*{key}\s*=", lines[i])), None)
         if place is not None:
             lines[place] = new
@@ -48,5 +49,10 @@ def set_values(path: Path, table: str, values: Mapping[str, Sequence[int]]) -> P
     return kept
 
 
-def _words(values: Mapping[str, Sequence[int]]) -> str:
-    return "; ".join(f"{key} = {list(value)}" for key, value in values.items())
+def _words(values: Mapping[str, Sequence[int] | str]) -> str:
+    return "; ".join(f"{key} = {_written(value)}" for key, value in values.items())
+
+
+def _written(value: Sequence[int] | str) -> str:
+    # What JSON writes of a text is a basic string of TOML too.
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else f"[{', '.join(map(str, value))}]"

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import typer
 
-from service.commands import calibrate_response, calibrate_solve, calibrate_sync, calibrate_target, calibrate_verify
+from service.commands import (
+    calibrate_response,
+    calibrate_run,
+    calibrate_solve,
+    calibrate_sync,
+    calibrate_target,
+    calibrate_verify,
+)
 
 group = typer.Typer(
-    help="Calibrate a rig: print a target, solve from captures of it, check the result.",
+    help="Calibrate a rig: print a target, be guided through its poses, solve from captures, check the result.",
     rich_markup_mode=None,
     no_args_is_help=True,
 )
+group.command("run")(calibrate_run.run)
 group.command("solve")(calibrate_solve.solve)
 group.command("target")(calibrate_target.target)
 group.command("verify")(calibrate_verify.verify)

@@ -85,7 +85,7 @@ def solve(
       fringed calibrate solve poses/ --target chessboard:9x6:30 --baseline 240 -o rig.json --json
       fringed calibrate solve wedge/ --target wedge:wedge.json --model hall -o rig.json
     """
-    stated = None if length is None else _length(length)
+    stated = None if length is None else length_given(length)
     drawing = output.with_suffix(".png") if picture else None
     if not force:
         for path in (output, drawing):
@@ -117,18 +117,16 @@ def solve(
 
             replace_file(drawing, draw(solution))
         replace_file(output, as_text(content).encode())
-    if as_json:
-        print_json(_document(solution, content, output, drawing))
-    else:
-        _show(solution, content, output, drawing)
-        for one in solution.left_out:
-            print_error(f"left out {one.name}: {one.reason}", label="warning")
-    for warning in solution.warnings:
-        print_error(warning, label="warning")
+    report(solution, content, output, drawing, as_json=as_json)
     return 0
 
 
-def _length(text: str) -> tuple[float, float]:
+def length_given(text: str) -> tuple[float, float]:
+    """MM[:SIGMA] as two numbers.
+
+    Raises:
+        typer.BadParameter: it is not.
+    """
     mm, colon, sigma = text.partition(":")
     try:
         values = float(mm), float(sigma) if colon else 0.1
@@ -137,6 +135,20 @@ def _length(text: str) -> tuple[float, float]:
     if not (0 < values[0] < 1e6 and 0 < values[1] < values[0]):
         raise typer.BadParameter(f"--length: {text!r} is no length with its uncertainty")
     return values
+
+
+def report(
+    solution: Solution, content: dict[str, Any], output: Path, drawing: Path | None, *, as_json: bool, **more: Any
+) -> None:
+    """Print what was found: the views, the figures, what was left out. more: members of the JSON document."""
+    if as_json:
+        print_json({**_document(solution, content, output, drawing), **more})
+    else:
+        _show(solution, content, output, drawing)
+        for one in solution.left_out:
+            print_error(f"left out {one.name}: {one.reason}", label="warning")
+    for warning in solution.warnings:
+        print_error(warning, label="warning")
 
 
 def _document(solution: Solution, content: dict[str, Any], output: Path, drawing: Path | None) -> dict[str, Any]:

@@ -1,0 +1,365 @@
+"""`fringed calibrate run`: from a rig to its calibration, guided at the terminal, pose by pose.
+
+What to say and when to capture is `scanner.calibration.guide`'s; here are keys, lines and files.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.commands.calibrate_solve import TARGET_HELP, length_given, report
+from service.commands.options import AsJson, Connect, output_path
+from service.terminal import progress_lines
+
+if TYPE_CHECKING:
+    from scanner.calibration.solve import Solution, SolveOptions
+    from scanner.calibration.targets import Target
+    from service.config import RigConfig
+    from service.guided_calibration import GuidedCalibration
+    from service.keys import Keys
+
+CALIBRATION_FILE = "calibration.json"
+RESULT_PICTURE = "calibration.png"
+LIVE_PICTURE = "calibrate.png"
+PATIENCE_S = 60.0
+"""With nobody at a terminal: without a new pose for so long the run ends with what there is."""
+SEE_S = 0.2
+"""A key is looked for this often."""
+GAMMA_OFF = 0.02
+"""Exponent's distance from 1 from which it is kept for projection: below, 8-bit projection leaves as much ripple."""
+
+
+def run(
+    target: Annotated[str, typer.Option(metavar="TARGET", help=TARGET_HELP)],
+    rig: Annotated[str | None, typer.Argument(metavar="RIG", help="A rig file, or simulated[:SCENE].")] = None,
+    connect: Connect = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="DIR", parser=output_path, help="Folder; poses in it are taken up again."
+        ),
+    ] = None,
+    auto: Annotated[
+        bool, typer.Option("--auto", help="Capture by itself, when the target stands still in a new pose.")
+    ] = False,
+    poses: Annotated[int, typer.Option(metavar="N", min=3, max=40, help="Poses after which the run ends.")] = 12,
+    picture: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", parser=output_path, help="Live picture (png, jpg); else calibrate.png in DIR."),
+    ] = None,
+    length: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MM[:SIGMA]",
+            help="Measured length of the target's longest row of points, end to end, and its 1-sigma (0.1 mm).",
+        ),
+    ] = None,
+    rigid: Annotated[
+        bool, typer.Option("--rigid", help="The target is glass or metal: no stretch and no bow are fitted.")
+    ] = False,
+    baseline: Annotated[
+        float | None,
+        typer.Option(metavar="MM", min=1, max=1e5, help="Distance from lens to lens by a rule, to check by."),
+    ] = None,
+    distance: Annotated[
+        float | None, typer.Option(metavar="MM", min=1, max=1e6, help="Distance of the targets by a rule, to check by.")
+    ] = None,
+    warm_up: Annotated[
+        float | None, typer.Option(metavar="MINUTES", min=0, max=1e5, help="How long the rig had been on; is recorded.")
+    ] = None,
+    write: Annotated[
+        bool, typer.Option("--write", help="Name the calibration in the rig file (a copy is kept beside it).")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the calibration of an earlier run in DIR.")] = False,
+    as_json: AsJson = False,
+) -> int:
+    """Calibrate a rig, guided: where to hold the target next, and how good each pose was.
+
+    Latency is measured first. Then, for each pose: Enter captures (or --auto), u takes the last pose back, q ends. Look
+    at the live picture in a viewer that reloads it. Without a terminal it captures by itself.
+
+    \b
+    Examples:
+      fringed calibrate run bench.toml --target charuco:10x7:30 --length 240.1:0.05 -o bench-calibration
+      fringed calibrate run bench.toml --target charuco:10x7:30 --auto --write
+      fringed calibrate run "simulated:casey2011/charuco_poses?walk=true" --target charuco:10x7:30
+    """
+    from scanner.calibration.solve import SolveOptions  # noqa: PLC0415
+    from scanner.calibration.targets import parse_target  # noqa: PLC0415
+    from scanner.errors import ConfigError  # noqa: PLC0415
+    from service.config import is_simulated  # noqa: PLC0415
+
+    if (rig is None) == (connect is None):
+        raise typer.BadParameter("give RIG, or --connect to a running daemon, which has a rig of its own")
+    if write and (rig is None or is_simulated(rig)):
+        raise ConfigError("there is no rig file to write to", hint="leave --write out")
+    options = SolveOptions(None if length is None else length_given(length), rigid, baseline, distance, warm_up)
+    looked_for = parse_target(target)
+    if not looked_for.flat:
+        raise ConfigError(
+            "a target in space is not moved from pose to pose",
+            hint="fringed scan --axis xy -o wedge, then fringed calibrate solve wedge --model hall",
+        )
+    folder = output or Path(datetime.now().astimezone().strftime("calibration-%Y%m%d-%H%M%S"))
+    result = folder / CALIBRATION_FILE
+    if result.exists() and not force:
+        raise typer.BadParameter(f"-o: {result} exists; --force goes on with its poses and replaces it")
+    folder.mkdir(parents=True, exist_ok=True)
+    solution, response = _guided(
+        rig, connect, looked_for, options, _Asked(folder, picture or folder / LIVE_PICTURE, poses, auto)
+    )
+    content, drawing = _written(solution, response, result, folder / RESULT_PICTURE)
+    report(solution, content, result, drawing, as_json=as_json, response=response)
+    _named_in_rig(rig, result, write=write)
+    return 0
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What the command line asked of the loop."""
+
+    folder: Path
+    picture: Path
+    poses: int
+    auto: bool
+
+
+def _guided(
+    rig: str | None, connect: str | None, target: Target, options: SolveOptions, asked: _Asked
+) -> tuple[Solution, dict[str, Any] | None]:
+    """Measure, guide, solve: the rig, and the projector's response where it was told."""
+    from scanner.client import Client  # noqa: PLC0415
+    from scanner.errors import ScannerError  # noqa: PLC0415
+    from service.guided_calibration import GuidedCalibration  # noqa: PLC0415
+    from service.keys import keys  # noqa: PLC0415
+
+    with _daemon(rig, connect) as endpoint, Client(endpoint, name="fringed calibrate run") as client:
+        session = GuidedCalibration(client, target, asked.folder, options)
+        try:
+            if taken_up := session.take_up():
+                say(f"{taken_up} poses of {asked.folder} are taken up")
+            with keys() as pressed:
+                loop = _Loop(session, asked, pressed)
+                loop.run()
+            with progress_lines() as lines:
+                return session.solved(leave_out=True, progress=lines.stage), loop.response
+        except (KeyboardInterrupt, ScannerError):
+            if session.observations:
+                say(f"the poses are kept: the same command with -o {asked.folder} goes on with them")
+            raise
+        finally:
+            session.close()
+
+
+@contextmanager
+def _daemon(rig: str | None, connect: str | None) -> Iterator[str]:
+    """The daemon named, or a private one with this rig and its latency measured."""
+    from service.config import load_rig  # noqa: PLC0415
+    from service.private import private_daemon  # noqa: PLC0415
+
+    if rig is None:
+        say("latency: as the daemon knows or measures it")
+        yield str(connect)
+        return
+    config = _in_step(load_rig(rig))
+    with private_daemon(config) as endpoint:
+        yield endpoint
+
+
+def _in_step(config: RigConfig) -> RigConfig:
+    """The rig with latency and settling: from its file, or measured now."""
+    from scanner.clock import MonotonicClock  # noqa: PLC0415
+    from scanner.errors import ConfigError  # noqa: PLC0415
+    from service.sync_measure import measure_sync  # noqa: PLC0415
+
+    projector = config.projector
+    if projector.latency_us is not None and projector.settle_us is not None:
+        say("latency and settling: taken from the rig file")
+        return config
+    with progress_lines() as lines:
+        found = measure_sync(config, MonotonicClock(), lines.stage)
+    measured = found.rig_lines()
+    words = ", ".join(f"{key} = {value}" for key, value in measured.items())
+    say(f"measured: {words} (fringed calibrate sync --write keeps them in the rig file)")
+    if found.refused:
+        raise ConfigError(f"no scan can work: {found.refused}")
+    part = {key: tuple(value) for key, value in measured.items()}
+    return config.model_copy(update={"projector": projector.model_copy(update=part)})
+
+
+class _Loop:
+    """Preview, keys, captures, until there are enough poses or somebody ends it."""
+
+    def __init__(self, session: GuidedCalibration, asked: _Asked, keys: Keys) -> None:
+        from scanner.calibration.guide import Stillness  # noqa: PLC0415
+
+        self._session, self._asked, self._keys = session, asked, keys
+        self._auto = asked.auto or not keys.there
+        self._still: Stillness | None = None
+        self._new = Stillness
+        self._seen: Any = "no picture of the camera yet"
+        self._progress_s = time.monotonic()
+        self._told = False
+        self.response: dict[str, Any] | None = None
+        """the projector's, where scans should undo it"""
+
+    def run(self) -> None:
+        """Until the end."""
+        how = "captures by itself when the target stands still" if self._auto else "Enter captures"
+        say(f"{how}; u takes the last pose back, q ends. Live picture: {self._asked.picture}")
+        self._tell_response()
+        self._say_next()
+        while len(self._session.observations) < self._asked.poses:
+            key = self._keys.pressed()
+            if key == "q":
+                break
+            if key == "u":
+                self._undo()
+            ready = self._look()
+            if (key in "\r\n" and key) or (self._auto and ready):
+                self._capture()
+            if not self._keys.there and time.monotonic() - self._progress_s > PATIENCE_S:
+                say(f"no new pose for {PATIENCE_S:.0f} s: {self._last_line()}")
+                break
+        clear_line()
+
+    def _look(self) -> bool:
+        """Look at the newest picture; whether the target has stood still in a new pose."""
+        from scanner.calibration.guide import status  # noqa: PLC0415
+
+        found = self._session.see(SEE_S)
+        guide = self._session.guide
+        if found is None or guide is None:
+            return False
+        pixels, self._seen, t_s = found
+        line = status(self._seen, guide)
+        draw_line(f"[{len(self._session.observations)}/{self._asked.poses}] {line}")
+        self._draw(pixels, line)
+        if self._still is None:
+            self._still = self._new(guide.size[0])
+        if isinstance(self._seen, str) or self._seen.trouble is not None or not guide.is_new(self._seen):
+            self._still.forget()
+            return False
+        return self._still.see(t_s, self._seen)
+
+    def _capture(self) -> None:
+        if isinstance(self._seen, str):
+            say(f"not captured: {self._seen}")
+            return
+        draw_line("capturing: hold it still")
+        good, words = self._session.capture(_frames)
+        number = len(self._session.observations)
+        say(f"pose {number}: {words}" if good else f"not kept: {words}")
+        if self._still is not None:
+            self._still.forget()
+        if good:
+            self._progress_s = time.monotonic()
+            self._tell_response()
+            self._say_next()
+
+    def _tell_response(self) -> None:
+        """Once, from the first pose."""
+        if self._session.observations and not self._told:
+            self.response, self._told = _response(self._session), True
+
+    def _undo(self) -> None:
+        name = self._session.undo()
+        say("there is no pose to take back" if name is None else f"pose {name} is taken back")
+
+    def _say_next(self) -> None:
+        guide = self._session.guide
+        if guide is not None and len(guide.poses) < self._asked.poses:
+            say(f"next: {guide.advice()}")
+
+    def _last_line(self) -> str:
+        return self._seen if isinstance(self._seen, str) else self._seen.trouble or "the target stands as before"
+
+    def _draw(self, pixels: Any, line: str) -> None:
+        from scanner.calibration.guide_picture import guide_picture  # noqa: PLC0415
+        from scanner.live_picture import encoded  # noqa: PLC0415
+        from scanner.storage import replace_file  # noqa: PLC0415
+
+        guide, path = self._session.guide, self._asked.picture
+        if guide is not None:
+            replace_file(path, encoded(guide_picture(pixels, self._seen, guide, line, guide.advice()), path.suffix))
+
+
+def _frames(event: Any) -> None:
+    if event.kind == "frame":
+        draw_line(f"capturing: hold it still ({event.fields.get('captured', 0)} of {event.fields.get('total', '?')})")
+    elif event.kind == "acquired":
+        draw_line("captured; decoding")
+
+
+def _response(session: GuidedCalibration) -> dict[str, Any] | None:
+    """The projector's gamma, told in words; as the calibration file has it where scans should undo it."""
+    from scanner.calibration.response import Response  # noqa: PLC0415
+
+    found = session.response()
+    if not isinstance(found, Response):
+        say(f"response: not told ({found})")
+        return None
+    off = abs(found.exponent - 1)
+    real = off > max(3 * found.sigma, GAMMA_OFF) and found.gamma is not None
+    say(
+        f"response: light follows what is projected to the power of {found.exponent:.3f} +- {found.sigma:.3f}; "
+        f"ripple {found.ripple_px:.3f} px; "
+        + (f"scans will project with gamma {found.gamma:.3f}" if real else "nothing to correct")
+    )
+    return {"gamma": found.gamma, "table": None} if real else None
+
+
+def _written(
+    solution: Solution, response: dict[str, Any] | None, result: Path, drawing: Path
+) -> tuple[dict[str, Any], Path]:
+    from scanner.calibration.calibration_file import as_text, calibration_dict  # noqa: PLC0415
+    from scanner.calibration.pictures import draw  # noqa: PLC0415
+    from scanner.storage import replace_file  # noqa: PLC0415
+
+    if response is not None:
+        solution = replace(solution, response=response)
+    content = calibration_dict(solution)
+    replace_file(drawing, draw(solution))
+    replace_file(result, as_text(content).encode())
+    return content, drawing
+
+
+def _named_in_rig(rig: str | None, result: Path, *, write: bool) -> None:
+    from service.rig_file_edit import set_values  # noqa: PLC0415
+
+    if write and rig is not None:
+        kept = set_values(Path(rig), "rig", {"calibration": str(result.absolute())})
+        say(f"{rig} names this calibration now; what it was before is in {kept}")
+    else:
+        say(f'to use it, in the rig file:\n[rig]\ncalibration = "{result.absolute()}"')
+
+
+# --- the terminal -------------------------------------------------------------------------------------------------
+
+
+def say(words: str) -> None:
+    """A line that stays, on standard error."""
+    clear_line()
+    print(words, file=sys.stderr, flush=True)
+
+
+def draw_line(words: str) -> None:
+    """The line that is drawn in place of the one before; nothing where standard error is no terminal."""
+    if sys.stderr.isatty():
+        print(f"\r\x1b[2K{words[: shutil.get_terminal_size().columns - 1]}", end="", file=sys.stderr, flush=True)
+
+
+def clear_line() -> None:
+    """Take the drawn line away."""
+    if sys.stderr.isatty():
+        print("\r\x1b[2K", end="", file=sys.stderr, flush=True)

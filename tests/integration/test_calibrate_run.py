@@ -1,0 +1,86 @@
+"""`fringed calibrate run` as a whole: a target that walks through its poses, captured by itself, to a calibration."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.simulated.rigs import rig as reference_rig
+from scanner.calibration.solve import SolveOptions
+from scanner.calibration.targets import parse_target
+from scanner.capture import Capture
+from scanner.geometry import load_calibration
+from service.cli import main
+from service.config import load_rig
+from service.guided_calibration import GuidedCalibration
+
+TARGET = "chessboard:9x6:19"
+POSES = 3
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rig that knows its latency, so that no test waits for its measurement."""
+    path = tmp_path_factory.mktemp("rig") / "rig.toml"
+    device = "quick/chessboard_poses?walk=true"
+    path.write_text(
+        f'[rig]\nname = "walk"\n[camera]\ndriver = "simulated"\ndevice = "{device}"\n'
+        f'[projector]\ndriver = "simulated"\ndevice = "{device}"\nlatency_us = [4000, 4400]\nsettle_us = [100, 300]\n'
+    )
+    return path
+
+
+def test_a_rig_is_calibrated_by_itself(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "calibration"
+    words = ["calibrate", "run", str(rig), "--target", TARGET, "-o", str(folder)]
+    assert main([*words, "--poses", str(POSES), "--write", "--json"]) == 0
+    said = capsys.readouterr()
+    document = json.loads(said.out)
+    assert {path.name for path in folder.iterdir()} == {
+        *("poses", "calibrate.png", "calibration.json", "calibration.png")
+    }
+    # Every pose another one, both axes, kept as a capture of its own.
+    assert [view["name"] for view in document["views"]] == [f"{n + 1:02d}" for n in range(POSES)]
+    first = Capture.open(folder / "poses" / "01")
+    assert set(first.header.sequence.pattern.axes) == {"x", "y"}  # type: ignore[union-attr]
+    assert document["calibration"]["scale"] == "unverified"
+    for words_said in (
+        "taken from the rig file",
+        "response: light follows",
+        "pose 3: 54 points; residual 0.0",
+        "next:",
+    ):
+        assert words_said in said.err
+    # What three poses of a quick rig tell, against the truth: to a per cent or two.
+    found, truth = load_calibration(folder / "calibration.json"), reference_rig("quick").calibration
+    assert found.camera.matrix[0, 0] == pytest.approx(truth.camera.matrix[0, 0], rel=0.02)
+    assert np.linalg.norm(found.translation) == pytest.approx(np.linalg.norm(truth.translation), rel=0.03)
+    assert load_rig(rig).rig.calibration == folder / "calibration.json"
+
+    # A finished run is not replaced unasked.
+    assert main(words) == 2
+    assert "--force" in capsys.readouterr().err
+    # One that goes on takes its poses up again; the last can be taken back.
+    again = GuidedCalibration(None, parse_target(TARGET), folder, SolveOptions())  # type: ignore[arg-type]  asked nothing
+    assert again.take_up() == len(again.captures) == POSES
+    assert again.solved().state.camera.matrix[0, 0] == pytest.approx(found.camera.matrix[0, 0])
+    assert again.undo() == f"{POSES:02d}"
+    assert len(again.captures) == POSES - 1
+    again.close()
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (["--target", TARGET], 2, "--connect"),
+        (["simulated", "--target", TARGET, "--write"], 1, "no rig file"),
+        (["simulated", "--target", "wedge:wedge.json"], 1, "wedge.json"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_before_a_device_is_opened(
+    words: list[str], status: int, said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main(["calibrate", "run", *words, "-o", str(tmp_path / "out")]) == status
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
