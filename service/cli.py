@@ -17,6 +17,10 @@ from types import FrameType
 
 INTERRUPTED = 130
 
+# Processes are what shares processors out here. OpenBLAS's own threads spin while they wait for one another: beside
+# other work a calibration of a second takes fifteen. Children inherit it; NumPy reads it when it is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""

@@ -7,6 +7,7 @@ everything else of this project works.
 from __future__ import annotations
 
 import ctypes
+import os
 from collections.abc import Iterator
 from ctypes import c_char_p, c_int, c_uint8, c_uint32, c_void_p
 from dataclasses import dataclass
@@ -117,9 +118,11 @@ def start() -> ctypes.CDLL:
     sdl.SDL_SetHint(b"SDL_VIDEO_MINIMIZE_ON_FOCUS_LOSS", b"0")
     sdl.SDL_SetHint(b"SDL_NO_SIGNAL_HANDLERS", b"1")  # signals are the program's
     sdl.SDL_SetHint(b"SDL_RENDER_SCALE_QUALITY", b"0")
-    if sdl.SDL_InitSubSystem(_VIDEO):
+    # Without a desktop SDL may find itself a driver that draws into memory, and call that a display.
+    desktop = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"))
+    if not desktop or sdl.SDL_InitSubSystem(_VIDEO):
         raise DeviceNotFound(
-            f"no desktop to open a window on: {problem(sdl)}",
+            f"no desktop to open a window on{f': {problem(sdl)}' if desktop else ''}",
             device="window",
             hint="set DISPLAY or WAYLAND_DISPLAY; on a rig without a desktop, use the driver kms",
         )

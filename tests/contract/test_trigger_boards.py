@@ -51,6 +51,7 @@ class TestSerialTriggerBoardOnSimulatedOne(TriggerContract):
             board.close()
 
 
+@pytest.mark.real_time
 class TestSerialTriggerBoardOnTheFirmware(TriggerContract):
     @pytest.fixture
     def bench(self, simavr: Simavr) -> Iterator[TriggerBench]:
