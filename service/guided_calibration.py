@@ -162,11 +162,11 @@ class GuidedCalibration:
             if one.name == name:
                 return f"{one.reason} (u takes it back)"
         k = next(i for i, view in enumerate(solution.problem.views) if view.name == name)
-        camera, projector = (
-            rms(residuals[k])
-            for residuals in (solution.adjusted.camera_residuals, solution.adjusted.projector_residuals)
-        )
-        return f"residual {camera:.3f} px in the camera, {projector:.3f} px in the projector"
+        adjusted = solution.adjusted
+        kept = adjusted.kept[k]
+        camera, projector = (rms(each[k][kept]) for each in (adjusted.camera_residuals, adjusted.projector_residuals))
+        dropped = f" ({int((~kept).sum())} points dropped)" if not kept.all() else ""
+        return f"residual {camera:.3f} px in the camera, {projector:.3f} px in the projector{dropped}"
 
     def response(self) -> Response | str:
         """The projector's response as the first pose's frames tell it, or why they do not."""

@@ -297,6 +297,8 @@ class _Loop:
 def _frames(event: Any) -> None:
     if event.kind == "frame":
         draw_line(f"capturing: hold it still ({event.fields.get('captured', 0)} of {event.fields.get('total', '?')})")
+    elif event.kind == "retake":
+        draw_line("frames were out of step and are taken again: hold it still")
     elif event.kind == "acquired":
         draw_line("captured; decoding")
 
