@@ -37,6 +37,9 @@ INCOMING = ".incoming"
 PREVIEW_HZ = 2.0
 PREVIEW_WIDTH = 2048
 """The widest the daemon sends: corners are looked for in the camera's own pixels wherever that goes."""
+LATE_S = 10.0
+"""Without a picture for so long the daemon is asked for them again."""
+
 OnEvent = Callable[[Event], None]
 
 
@@ -54,6 +57,7 @@ class GuidedCalibration:
         self._context = zmq.Context()
         self._preview: zmq.Socket[bytes] | None = None
         self._after_ns = 0
+        self._heard_s = time.monotonic()
         shutil.rmtree(folder / INCOMING, ignore_errors=True)  # of a run that was interrupted
 
     def close(self) -> None:
@@ -183,12 +187,20 @@ class GuidedCalibration:
     # --- preview ---------------------------------------------------------------------------------------------------
 
     def see(self, timeout_s: float) -> tuple[NDArray[Any], Sight | str, float] | None:
-        """The newest preview picture, what is seen in it, and when it was taken, s; None where none came in time."""
+        """The newest preview picture, what is seen in it, and when it was taken, s; None where none came in time.
+
+        Raises:
+            Unreachable: the daemon is gone.
+        """
         if self._preview is None:
             endpoint = self._client.preview_start(rate_hz=PREVIEW_HZ, max_width=PREVIEW_WIDTH)
             self._preview = conflated(self._context.socket(zmq.SUB), endpoint)
         if not self._preview.poll(int(1e3 * timeout_s)):
+            if time.monotonic() - self._heard_s > LATE_S:
+                self._heard_s = time.monotonic()
+                self._client.preview_start(rate_hz=PREVIEW_HZ, max_width=PREVIEW_WIDTH)  # or it says why not
             return None
+        self._heard_s = time.monotonic()
         header, pixels = decode_preview(self._preview.recv())
         if header.t_ns < self._after_ns:
             return None  # from before the last capture

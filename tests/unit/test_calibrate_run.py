@@ -1,0 +1,151 @@
+"""The terminal's side of `fringed calibrate run`, with no device: keys, lines, and when the loop ends."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scanner.calibration.guide import Guide, Seen
+from scanner.calibration.sight import Sight, Standing
+from scanner.calibration.targets import parse_target
+from service.commands import calibrate_run
+from service.keys import Keys, keys
+from service.rig_file_edit import set_values
+from tests.unit.simulated_bench import Bench
+
+TARGET = parse_target("chessboard:9x6:19")
+SIZE = (320, 240)
+
+
+class Pressed(Keys):
+    """Somebody who presses these keys, one each time one is looked for."""
+
+    def __init__(self, pressed: str) -> None:
+        super().__init__(0)
+        self._coming = list(pressed)
+
+    def pressed(self) -> str:
+        return self._coming.pop(0).strip(" ") if self._coming else ""
+
+
+class Session:
+    """A guided calibration whose camera sees what it is told to, twice a second."""
+
+    def __init__(self, *sights: Sight | str, guide: Guide | None = None) -> None:
+        self.observations: list[Any] = []
+        self.guide = guide or Guide(TARGET, SIZE)
+        self._sights = list(sights)
+        self._t_s = 0.0
+
+    def see(self, timeout_s: float) -> tuple[np.ndarray, Sight | str, float]:
+        self._t_s += 0.5
+        seen = self._sights.pop(0) if len(self._sights) > 1 else self._sights[0]
+        return np.zeros(SIZE[::-1], np.uint8), seen, self._t_s
+
+    def capture(self, on_event: Any) -> tuple[bool, str]:
+        self.observations.append(self._t_s)
+        return True, f"captured at {self._t_s}"
+
+    def undo(self) -> str | None:
+        return f"{self.observations.pop()}" if self.observations else None
+
+    def response(self) -> str:
+        return "no fringes here"
+
+
+def sight_at(x: float, trouble: str | None = None) -> Sight:
+    points = TARGET.points[:, :2] + np.array([100.0 + x, 100.0])
+    return Sight(np.arange(len(points)), points, Standing(10.0, "left", 700.0), trouble)
+
+
+def loop(session: Session, folder: Path, pressed: Keys, *, auto: bool = False, poses: int = 3) -> None:
+    asked = calibrate_run._Asked(folder, folder / "live.png", poses, auto)
+    calibrate_run._Loop(session, asked, pressed).run()  # type: ignore[arg-type]  a session as far as the loop asks
+
+
+def test_keys_capture_take_back_and_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    session = Session(sight_at(0))
+    loop(session, tmp_path, Pressed("u \n\nu\nq\n"))
+    assert len(session.observations) == 2
+    said = capsys.readouterr().err
+    assert "no pose to take back" in said
+    assert "pose 2: captured" in said
+    assert "is taken back" in said
+    assert "response: not told (no fringes here)" in said
+    assert (tmp_path / "live.png").stat().st_size > 1000
+
+
+def test_what_is_not_seen_is_not_captured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    session = Session("no chessboard in the picture")
+    loop(session, tmp_path, Pressed(" \nq"))
+    assert session.observations == []
+    assert "not captured: no chessboard in the picture" in capsys.readouterr().err
+
+
+def test_by_itself_it_waits_until_the_target_stands_still_in_a_good_new_pose(tmp_path: Path) -> None:
+    earlier = sight_at(0)
+    guide = Guide(TARGET, SIZE, (Seen("01", earlier.ids, earlier.points),))
+    moving = [sight_at(20.0 + 5 * k) for k in range(4)]
+    session = Session(
+        *[earlier] * 4, *[sight_at(90, "too tilted")] * 4, "not seen", *moving, *[sight_at(60)] * 20, guide=guide
+    )
+    loop(session, tmp_path, Keys(None), poses=1)
+    # Thirteen looks in vain, then one that begins a second and two that complete it.
+    assert session.observations == [0.5 * 16]
+
+
+def test_with_nobody_there_it_ends_when_nothing_new_comes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(calibrate_run, "PATIENCE_S", -1.0)
+    session = Session("the picture is dark")
+    loop(session, tmp_path, Keys(None))
+    assert "the picture is dark" in capsys.readouterr().err
+
+
+def test_keys_come_one_by_one_from_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    host, terminal = os.openpty()
+    try:
+        with os.fdopen(terminal, "r") as stdin:
+            monkeypatch.setattr(sys, "stdin", stdin)
+            with keys() as pressed:
+                assert pressed.there
+                assert pressed.pressed() == ""
+                os.write(host, b"U\n")
+                assert [pressed.pressed(), pressed.pressed(), pressed.pressed()] == ["u", "\n", ""]
+    finally:
+        os.close(host)
+
+
+def test_a_calibration_is_named_in_the_rig_file(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.toml"
+    rig.write_text('[rig]\nname = "bench"  # ours\n[camera]\ndriver = "simulated"\n[projector]\ndriver = "simulated"\n')
+    named = tmp_path / 'a "quoted" name.json'
+    named.write_text("{}")
+    set_values(rig, "rig", {"calibration": str(named)})
+    assert rig.read_text().splitlines()[:3] == [
+        "[rig]",
+        f'calibration = "{tmp_path}/a \\"quoted\\" name.json"',
+        'name = "bench"  # ours',
+    ]
+
+
+@pytest.mark.parametrize(("walk", "moves"), [("true", True), ("false", False)])
+def test_a_simulated_target_walks_once_a_sequence_was_shown(walk: str, moves: bool) -> None:
+    bench = Bench(f"quick/chessboard_poses?walk={walk}&pose=11")
+    world = bench.camera._world
+    before = world.view
+    for images in (9, 1):
+        bench.greys(*range(10, 10 + images))
+        assert world.view is before  # what was shown before was one image, or nothing
+        for index in range(images):
+            bench.steady(index)
+        if images == 9:
+            bench.greys(255)
+            assert (world.view is not before) == moves
+            before = world.view
