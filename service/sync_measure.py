@@ -18,8 +18,9 @@ from scanner.sequencer.light import Light, measure_light
 from service.config import RigConfig
 from service.scan_setup import OpenRig, default_pattern, open_rig
 
-ROUNDS = 3
-"""Searches for the light's begin and end, each with flips of its own: their union covers what jitters slowly"""
+ROUNDS, MOST_ROUNDS = 3, 6
+"""Searches for the light's begin and end, each with flips of its own: their union covers what jitters slowly. More
+where none of them caught the light's begin, as on a machine that is busy"""
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,11 @@ class Sync:
             name: [interval.low_ns // 1000, -(-interval.high_ns // 1000)]
             for name, interval in (("latency_us", self.latency), ("settle_us", self.settle))
         }
+
+    @property
+    def is_poor(self) -> bool:
+        """The light's begin was never caught, or the two ends lie a refresh apart: worth measuring again."""
+        return self.latency.low_ns == 0 or self.latency.high_ns - self.latency.low_ns > self.refresh_ns // 2
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data."""
@@ -70,9 +76,9 @@ def measure_sync(config: RigConfig, clock: Clock, stage: Callable[[str], None]) 
                 f"a {capabilities.kind.value} projector is not flipped by the host: there is no latency to measure",
                 device=opened.rig.projector.name,
             )
-        found = []
-        for n in range(ROUNDS):
-            stage(f"measuring latency, round {n + 1} of {ROUNDS}")
+        found: list[tuple[Interval, Interval]] = []
+        while len(found) < ROUNDS or (len(found) < MOST_ROUNDS and not any(one.low_ns for one, _ in found)):
+            stage(f"measuring latency, round {len(found) + 1}")
             rig = opened.rig
             found.append(
                 measure_latency(rig.projector, rig.camera, clock, settings=rig.settings, trigger_mode=rig.trigger_mode)
@@ -88,7 +94,9 @@ def measure_sync(config: RigConfig, clock: Clock, stage: Callable[[str], None]) 
 
 
 def _union(intervals: list[Interval]) -> Interval:
-    return Interval(min(i.low_ns for i in intervals), max(i.high_ns for i in intervals))
+    """What holds all of them; a lower end of 0 only says that no dark exposure was caught, so others go before it."""
+    lows = [i.low_ns for i in intervals if i.low_ns > 0] or [0]
+    return Interval(min(lows), max(i.high_ns for i in intervals))
 
 
 def _plan(opened: OpenRig, latency: Interval, settle: Interval) -> tuple[dict[str, Any] | None, str | None]:

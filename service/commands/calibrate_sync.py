@@ -42,14 +42,22 @@ def sync(
     config = load_rig(rig)
     with progress_lines() as progress:
         found = measure_sync(config, MonotonicClock(), progress.stage)
-    kept = set_values(Path(rig), "projector", found.rig_lines()) if write else None
+    if found.is_poor:
+        print_error(
+            "the latency is known to half a refresh only, or its begin was not caught",
+            "measure again while the machine has nothing else to do, with a brighter view",
+            label="warning",
+        )
+    kept = set_values(Path(rig), "projector", found.rig_lines()) if write and not found.is_poor else None
     if as_json:
-        print_json({**found.as_dict(), "written": write})
+        print_json({**found.as_dict(), "written": kept is not None})
         return 1 if found.refused else 0
     print_facts("sync", _facts(found))
     if kept is not None:
         print(f"\nwritten to {rig}; what it was before is in {kept}")
     else:
+        if write:
+            print_error("nothing was written to the rig file", label="warning")
         lines = "\n".join(f"{key} = {value}" for key, value in found.rig_lines().items())
         print(f"\n[projector]\n{lines}")
     if found.refused:

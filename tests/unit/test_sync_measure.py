@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from scanner.clock import VirtualClock
-from scanner.errors import ConfigError
+from scanner.errors import ConfigError, StorageError
 from service.config import RigConfig, load_rig, simulated_rig
 from service.rig_file_edit import set_values
 from service.sync_measure import Sync, measure_sync
@@ -88,3 +88,33 @@ def test_a_file_written_otherwise_is_left_as_it_was(tmp_path: Path, text: str) -
         set_values(path, "projector", {"latency_us": [1, 2]})
     assert "latency_us = [1, 2]" in caught.value.hint
     assert path.read_text() == text
+
+
+def test_line_ends_comments_and_links_stay(tmp_path: Path) -> None:
+    target, link = tmp_path / "target.toml", tmp_path / "link.toml"
+    before = RIG.format(more="latency_us = 7  # guessed\n").replace("\n", "\r\n")
+    target.write_bytes(before.encode())
+    link.symlink_to(target)
+    kept = set_values(link, "projector", {"latency_us": [3500, 4800]})
+    assert link.is_symlink()
+    assert kept.read_bytes() == before.encode()
+    assert target.read_bytes().decode() == before.replace(
+        "latency_us = 7  # guessed", "latency_us = [3500, 4800]  # guessed"
+    )
+
+
+def test_a_header_inside_a_text_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    text = '[rig]\nname = """\n[projector]\nlatency_us = 1\n"""\n' + RIG.format(more="")
+    path.write_text(text)
+    with pytest.raises(ConfigError, match="by line"):
+        set_values(path, "projector", {"latency_us": [1, 2]})
+    assert path.read_text() == text
+
+
+def test_a_read_only_file_is_left(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG.format(more=""))
+    path.chmod(0o444)
+    with pytest.raises(StorageError, match="read-only"):
+        set_values(path, "projector", {"latency_us": [1, 2]})
