@@ -201,7 +201,7 @@ class LiveStart(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=T
     retain: Literal["none", "ring", "record"] = "none"
     """frames kept: none; the last `ring_s` seconds; all"""
     ring_s: Annotated[float, Meta(gt=0, le=3600)] = 10.0
-    seconds: Annotated[float, Meta(gt=0)] | None = None
+    seconds: Annotated[float, Meta(gt=0, le=31_536_000)] | None = None
     """the run ends by itself after this long; None: when it is stopped"""
 
 

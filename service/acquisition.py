@@ -173,7 +173,8 @@ class Scan:
         return outcome
 
     def _exposure_ns(self) -> int | None:
-        wanted = self._params.exposure or self._opened.exposure or "auto"
+        given = self._params.exposure
+        wanted = given if given is not None else self._opened.exposure or "auto"
         if isinstance(wanted, str):
             return self._auto_exposure_ns()
         if not 0 < wanted <= 10_000_000:

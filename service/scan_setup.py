@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -200,10 +201,26 @@ def pattern_for(method: str, given: Mapping[str, Any], axis: Axis, projector: Pr
     if given.get("method", method) != method:
         raise ConfigError(f"the pattern is {given['method']!r}, the method {method!r}", hint="leave one of them out")
     default = default_pattern(method, tuple(given.get("axes") or (axis,)), given.get("axis", axis), projector)
+    _refuse_unknown(method, given, default)
     described = {**default.describe(), **given}
     if method == "pmp" and "frequencies" in given and "shifts" not in given:
         described["shifts"] = [8] * len(given["frequencies"])
     return pattern_from_description(described)
+
+
+_OF_SEQUENCES = frozenset({"method", "white", "black", "sentinels", "bars", "precorrection"})
+"""Members of a whole sequence's description, which a scan makes itself: a description may be given back as it was."""
+
+
+def _refuse_unknown(method: str, given: Mapping[str, Any], default: Pattern) -> None:
+    """A misspelt member must not be a scan without it."""
+    known = default.describe().keys()
+    for name in given.keys() - known - _OF_SEQUENCES:
+        near = get_close_matches(str(name), known, n=1)
+        raise ConfigError(
+            f"pattern member {name!r} says nothing to the method {method!r}",
+            hint=f"did you mean {near[0]!r}?" if near else f"its members: {', '.join(sorted(known))}",
+        )
 
 
 def default_pattern(method: str, axes: tuple[Axis, ...], axis: Axis, projector: ProjectorSize) -> Pattern:

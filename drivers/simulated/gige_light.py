@@ -147,7 +147,17 @@ class LightReceiver:
     """The camera's side: what it is told goes onto its world's timeline and lines."""
 
     def __init__(self, world: World, path: Path) -> None:
-        """Listen at `path`; a socket left there by a process that is gone is replaced."""
+        """Listen at `path`; a socket left there by a process that is gone is replaced.
+
+        Raises:
+            ConfigError: there is something else at `path`, or no folder for it.
+        """
+        if path.exists() and not path.is_socket():
+            raise ConfigError(
+                f"{path} is no socket, and the camera needs that name for one", hint="give another --light"
+            )
+        if not path.parent.is_dir():
+            raise ConfigError(f"{path.parent} is no folder", hint="give a --light in a folder that is there")
         self._world, self._path = world, path
         self._ended = threading.Event()
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)

@@ -53,7 +53,9 @@ def live(
     connect: Connect = None,
     xyz: Annotated[bool, typer.Option("--xyz", help="Send points in mm instead of projector rows.")] = False,
     stride: Annotated[int, typer.Option(metavar="N", min=1, max=64, help="With --xyz: every Nth pixel both ways.")] = 1,
-    seconds: Annotated[float | None, typer.Option(metavar="S", min=0.1, help="End after this long.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", min=0.1, max=31_536_000, help="End after this long.")
+    ] = None,
     record: Annotated[
         Path | None,
         typer.Option(metavar="DIR", parser=output_path, help="Keep all frames, as captures, in this folder."),

@@ -67,3 +67,26 @@ def test_the_inverse_of_a_response_makes_light_linear(gamma: float) -> None:
 def test_what_is_no_response(table: list[float]) -> None:
     with pytest.raises(ConfigError, match="rising"):
         inverse_table(table)
+
+
+@pytest.mark.parametrize(
+    ("method", "given", "says"),
+    [
+        ("pmp", {"frequencys": [1, 8]}, "did you mean 'frequencies'"),
+        ("pmp", {"axis": "q"}, "did you mean 'axes'"),
+        ("mcp", {"bitz": 3}, "did you mean 'bits'"),
+        ("gray", {"zzz": 1}, "its members"),
+    ],
+)
+def test_a_member_that_says_nothing_is_refused(method: str, given: dict[str, object], says: str) -> None:
+    with pytest.raises(ConfigError, match="says nothing") as caught:
+        pattern_for(method, given, "y", ProjectorSize(1152, 864))
+    assert says in (caught.value.hint or "")
+
+
+def test_a_description_may_be_given_back_as_it_was_written() -> None:
+    projector = ProjectorSize(1152, 864)
+    for method in ("pmp", "mcp", "gray", "cp"):
+        pattern = pattern_for(method, {}, "y", projector)
+        sequence = PatternSequence.bracketed(projector, pattern)
+        assert pattern_for(method, sequence.describe(), "y", projector) == pattern
