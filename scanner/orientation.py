@@ -20,11 +20,12 @@ STEP = 8
 MIN_SAMPLES = 100
 """Fewer say nothing of the whole."""
 
-MOST_REVERSED = 0.5
-"""More than half against the geometry is no noise: noise alone would turn round half at the very most."""
+MOST_REVERSED = 0.35
+"""More than a third against the geometry is no noise: noise alone turns round half where it is all there is, and
+sound scans stay below a hundredth or two; a code that is read as another one turns round half as well."""
 
 NOTICEABLE = 0.1
-"""Sound scans, silhouettes and all, stay below a hundredth or two."""
+"""Five times what silhouettes make of a sound scan"""
 
 
 def require_orientation(calibration: Calibration, values: NDArray[np.float32], axis: str) -> str | None:

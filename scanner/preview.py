@@ -90,13 +90,14 @@ def _figures(scan: Scan) -> list[tuple[str, str]]:
     """Number and what it is, for the title."""
     count = int(np.count_nonzero(scan.valid))
     figures = [(grouped(count), "points" if scan.xyz is not None else "pixels decoded")]
-    if scan.lit.any():
-        figures.append((f"{100 * scan.coverage:.1f} %", "of what is lit"))
+    if (lit := int(np.count_nonzero(scan.lit))) > 0:
+        share = count / lit if scan.xyz is not None else scan.coverage
+        figures.append((f"{100 * share:.1f} %", "of what is lit"))
     if scan.xyz is not None and (depth := _sample(scan.xyz[..., 2])).size:
         low, high = np.percentile(depth, (1, 99))
         figures.append((f"{grouped(low)} … {grouped(high)}", "mm depth"))
     if scan.sigma_z is not None and (sigma := _sample(scan.sigma_z)).size:
-        figures.append((f"{np.median(sigma):.3f}", "mm expected noise, 1σ"))
+        figures.append((f"{np.median(sigma):.3f}", "mm noise (median σ)"))
     return figures
 
 

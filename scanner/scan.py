@@ -156,7 +156,12 @@ class Scan:
                     vertices = vertices_of(self.xyz, normals, self.albedo, self.confidence)
                     write_ply(ply, vertices, ("fringed; mm, camera frame: x right, y down, z forward",))
             elif self.xyz is not None:
-                warnings.append("the cloud has no points: cloud.ply was not written")
+                warnings.append(f"the cloud has no points, and cloud.ply was not written{_why_empty(self.report)}")
+            else:
+                warnings.append(
+                    "without a calibration there are rows or columns, and no points: "
+                    "name one with --calibration, or in the rig file"
+                )
             with file("preview.png") as path:
                 replace_file(path, picture.result())
         if self.error_map is not None:
@@ -250,6 +255,15 @@ def filtered_points(
         reason = decoded.reason.copy()
         reason[(reason == Reason.VALUE) & np.isnan(found.xyz[..., 2])] = Reason.FILTERED
     return FilteredPoints(found.xyz, found.sigma_z, reason, {"impossible": found.impossible, **removed})
+
+
+def _why_empty(report: Mapping[str, Any]) -> str:
+    removed = {name: count for name, count in (report.get("removed") or {}).items() if count}
+    if not removed:
+        return ""
+    most = max(removed, key=lambda name: removed[name])
+    what = {"depth": "lay outside --depth", "box": "lay outside --box", "impossible": "had no depth on this rig"}
+    return f": {removed[most]:,} of them {what.get(most, f'fell to the filter for {most}')}"
 
 
 def load_scan(folder: Path) -> Scan:

@@ -49,7 +49,9 @@ def examine_rig(config: RigConfig, clock: Clock, stage: Stage) -> Iterator[Findi
         return
     try:
         yield Finding("devices", Level.OK, f"{opened.rig.camera.name}; {opened.rig.projector.name}")
-        for name, look in (("host", host), ("latency", latency), ("light", light), ("trigger line", pulses)):
+        looks = [("host", host), ("latency", latency), ("light", light)]
+        looks += [("trigger line", pulses)] if opened.rig.trigger is not None else []
+        for name, look in looks:
             stage(f"measuring {name}")
             try:
                 yield from look(opened, clock)
@@ -83,7 +85,10 @@ def latency(opened: OpenRig, clock: Clock) -> Iterator[Finding]:
     )
     said = f"{found.low_ns / 1e6:.2f} .. {found.high_ns / 1e6:.2f} ms, settled {settle.high_ns / 1e6:.2f} ms later"
     known, source = rig.latency or declared.latency, "rig file" if rig.latency else "driver"
-    if known is None:
+    if found.low_ns == 0 and found.high_ns > declared.refresh_ns // 4:
+        again = "try again while the machine has nothing else to do"
+        yield Finding("latency", Level.NOTE, f"{said}: the light's begin was not caught", again)
+    elif known is None:
         yield Finding("latency", Level.NOTE, f"{said}; the rig file has none", f"in [projector] write:\n{words}")
     elif found.high_ns < known.low_ns or found.low_ns > known.high_ns:
         wrong = f"{said}; the {source} says {known.low_ns / 1e6:.2f} .. {known.high_ns / 1e6:.2f} ms"

@@ -164,8 +164,15 @@ def decode_image(
         sigma_rows=sigma_rows if along_y else None,
         sigma_columns=None if along_y else sigma_rows,
         **turned,
+        warnings=(CAUTION,),
         details=details,
     )
+
+
+CAUTION = (
+    "first-generation composite pattern: depths are biased by centimetres (72 mm published, Casey 2011, table 5.6), "
+    "and the stated sigma is its random part only"
+)
 
 
 # --- carriers -----------------------------------------------------------------------------------------------------

@@ -48,10 +48,11 @@ def response(
     print_facts(
         "response",
         [
-            ("exponent", f"{found.exponent:.3f} +- {found.sigma:.3f} (1 is right)"),
+            ("exponent", f"{found.exponent:.3f} +- {found.sigma:.3f} left in this capture (1: the light is linear)"),
             ("ripple", f"{found.ripple_px:.3f} projector px rms in this capture"),
             ("misfit", f"{found.misfit_before:.2%} of the fringes, {found.misfit_after:.2%} with this exponent"),
-            ("project with gamma", projected or "the table used, followed by light ^ (1 / exponent)"),
+            ("gamma to undo", projected or "the table used, followed by light ^ (1 / exponent)"),
+            ("where", 'calibration file: "response": {"projector": {"gamma": ...}}; what was undone already is in it'),
         ],
     )
     return 0

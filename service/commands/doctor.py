@@ -39,7 +39,11 @@ def doctor(
         progress.stage("looking at the machine")
         findings = list(examine(Machine(), state_folder()))
         if config is not None:
-            findings += examine_rig(config, MonotonicClock(), progress.stage)
+            own = list(examine_rig(config, MonotonicClock(), progress.stage))
+            # What the camera's driver says of its own buffers goes before the general line.
+            known = {finding.subject for finding in own}
+            general = [f for f in findings if f.subject != "receive buffers" or "receive buffer" not in known]
+            findings = [*general, *own]
     counts = Counter(finding.level for finding in findings)
     if as_json:
         print_json({"ok": not counts[Level.BAD], "findings": [asdict(finding) for finding in findings]})

@@ -209,7 +209,11 @@ def _follower(folder: Path, lines: ProgressLines) -> Callable[[Event], None]:
                 if total:
                     lines.advance(done, total, f"{done} of {total} frames")
             case "retake":
-                lines.note(f"{fields.get('retakes', 'some')} frames so far were out of step and taken again")
+                total = int(fields.get("total", 0))
+                lines.stage("capturing", total or None)
+                lines.advance(
+                    total, total, f"{total} frames; {_counted(fields.get('retakes'))} taken again: out of step"
+                )
             case "acquired":
                 lines.stage("decoding")
             case "decoding":
@@ -217,6 +221,10 @@ def _follower(folder: Path, lines: ProgressLines) -> Callable[[Event], None]:
                 lines.stage("writing files" if stage.startswith("wrote ") else stage)
 
     return follow
+
+
+def _counted(retakes: Any) -> str:
+    return "1 was" if retakes == 1 else f"{retakes} were"
 
 
 def _cancel(client: Client, job_id: str) -> None:
