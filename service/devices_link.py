@@ -51,7 +51,9 @@ SILENCE_S = 30.0
 KILL_S = 10.0
 """A process in an uninterruptible call of the kernel does not die when it is killed."""
 
-DISCOVER_S = 15.0
+DISCOVER_S = 30.0
+"""Drivers look for twenty seconds at most, each in a process of its own."""
+
 _log = logging.getLogger(__name__)
 Publish = Callable[[str, str | None, Mapping[str, Any]], None]
 
@@ -90,6 +92,7 @@ class DevicesLink:
         """by job: when a devices process that says nothing must be gone, killing it included; the loop's time, s"""
         self._numbers = itertools.count(1)
         self._discoveries: dict[int, asyncio.Future[list[dict[str, Any]]]] = {}
+        self._looking: asyncio.Task[list[dict[str, Any]]] | None = None
         self._preview: Preview | None = None
         self.description: dict[str, Any] | None = None
         """camera and projector as opened; None while there are none"""
@@ -146,11 +149,16 @@ class DevicesLink:
         self._send(CancelAcquire(job))
 
     async def discover(self) -> list[dict[str, Any]]:
-        """The devices that the drivers can see.
+        """The devices that the drivers can see. Those who ask while it is being looked get the same answer.
 
         Raises:
             ScannerError: they cannot be asked now.
         """
+        if self._looking is None or self._looking.done():
+            self._looking = asyncio.create_task(self._discover())
+        return await asyncio.shield(self._looking)
+
+    async def _discover(self) -> list[dict[str, Any]]:
         await self.open()
         number = next(self._numbers)
         found: asyncio.Future[list[dict[str, Any]]] = asyncio.get_running_loop().create_future()
@@ -177,6 +185,9 @@ class DevicesLink:
 
     async def close(self) -> None:
         """Give the devices back and end the process."""
+        if self._looking is not None:
+            self._looking.cancel()
+            await asyncio.gather(self._looking, return_exceptions=True)
         if self._child is not None:
             await self._child.stop()
         if self._reader is not None:

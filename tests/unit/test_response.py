@@ -92,4 +92,4 @@ def test_the_command_says_what_to_project_with(tmp_path, capsys):
     assert main(["calibrate", "response", str(folder), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["exponent"] == pytest.approx(1.4, abs=0.03)
     assert main(["calibrate", "response", str(folder)]) == 0
-    assert "project with gamma" in capsys.readouterr().out
+    assert "gamma to undo" in capsys.readouterr().out
