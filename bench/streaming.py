@@ -45,8 +45,8 @@ breathe by a few MB. The spool holds the series being written and at times the o
 anywhere within one series: the slope of 42 such samples is uncertain by a sixth of a series over the run, and half a
 series is three times that. A leak of one hundredth of each series would be seen."""
 
-MOST_SPOOL_MB = (2 + 0.1) * SERIES_MB
-"""The series being written, the one before it until its deletion is through, and their lines."""
+MOST_SPOOL_MB = (AHEAD + 1 + 0.1) * SERIES_MB
+"""The series that is about to be deleted, those that were started ahead of it, and their lines."""
 
 
 @dataclass
