@@ -141,13 +141,13 @@ make_image() {
     say "writing the image"
     # fakeroot keeps owners and device nodes right in one go, also for an ordinary user.
     WORK=$work fakeroot bash -ec '
-        mkdir "$WORK/root"
-        tar -xf "$WORK/root.tar" -C "$WORK/root" --exclude="./dev/*"
-        mkdir -p "$WORK/root/lib/modules"
-        cp -r "$WORK"/kernel/lib/modules/* "$WORK/root/lib/modules/"
-        rm -f "$WORK/root/etc/resolv.conf"
-        for link in build source; do rm -f "$WORK"/root/lib/modules/*/$link; done
-        mke2fs -q -t ext4 -O ^has_journal -m 0 -L rig -d "$WORK/root" "$WORK/image" 2G >/dev/null' ||
+        mkdir "$WORK/tree"
+        tar -xf "$WORK/root.tar" -C "$WORK/tree" --exclude="./dev/*"
+        mkdir -p "$WORK/tree/lib/modules"
+        cp -r "$WORK"/kernel/lib/modules/* "$WORK/tree/lib/modules/"
+        rm -f "$WORK/tree/etc/resolv.conf"
+        for link in build source; do rm -f "$WORK"/tree/lib/modules/*/$link; done
+        mke2fs -q -t ext4 -O ^has_journal -m 0 -L rig -d "$WORK/tree" "$WORK/image" 2G >/dev/null' ||
         fail "the image could not be written"
 }
 
