@@ -125,7 +125,7 @@ make_initramfs() {
     local modules=$work/kernel/lib/modules ram=$work/ram path number=10 release
     release=$(cd "$modules" && echo *)
     mkdir -p "$ram/bin" "$ram/modules"
-    cp "$work/root/bin/busybox" "$ram/bin/"
+    cp "$work/tree/bin/busybox" "$ram/bin/"
     cp $box/initramfs "$ram/init"
     modprobe -d "$work/kernel" -S "$release" --show-depends -a virtio_pci virtio_blk virtio_console 9pnet_virtio 9p ext4 crc32c_generic |
         sed -n 's/^insmod \([^ ]*\).*/\1/p' | awk '!seen[$0]++' >"$work/order"
