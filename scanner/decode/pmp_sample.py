@@ -22,8 +22,9 @@ from scanner.decode.unwrapping import Ladder
 SIZE = 4096
 """Pixels of a first sample: the median of a twelfth of it is good to 5 %, its noise model to 2 %."""
 
-ENOUGH = 1024
-"""Pixels with light in them that a sample should have; larger ones are taken until it has, or there are no more."""
+ENOUGH = 2048
+"""Pixels with light in them that a sample should have; larger ones are taken until it has, or there are no more. Those
+of a run share their surface: fewer are a handful of places, and what these have in common is not the scene's."""
 
 _GROWTH = 8
 PRIOR_FREEDOM = 8.0
