@@ -13,8 +13,9 @@ soft:
     subpixel       the profile averaged along the stripe, its odd part fitted                      (not in the source)
     dense          rows between the stripes; all maps                                              2.1, 3.7
 
-`locate` says whether the pattern is there at all; `decoder` puts the stages in order. What the dissertation's own
-decoder does is named in each module; it is not this one.
+`locate` says whether the pattern is there at all; `decision` which stripe each peak is; `maps` what a pixel gets;
+`decoder` puts them in order, `door` turns images and maps. What the dissertation's own decoder does is named in each
+module; it is not this one.
 """
 
 from __future__ import annotations

@@ -1,45 +1,24 @@
-"""The default MCP decoder: one image in, maps out; the stages in order.
-
-Vertical stripes (axis "x") are turned into horizontal ones at the door and back at the end, so that one code serves
-both phase directions.
-"""
+"""The default MCP decoder: one image in, maps out; the stages in order, and the reason where there are no maps."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode import Decoded, Reason
+from scanner.decode import Decoded
 from scanner.decode.frames import FrameCheck
-from scanner.decode.mcp import dense, emissions, hmm, linking, magnification, stripes, subpixel
-from scanner.decode.mcp.locate import Array, Found, Image, Known, Stages, locate
+from scanner.decode.mcp.decision import Decision, decide
+from scanner.decode.mcp.door import grey, turned_back, upright_image, upside_down
+from scanner.decode.mcp.locate import Found, Image, Known, Stages, locate
+from scanner.decode.mcp.maps import maps_of
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.white import RATIO_BITS, divided, in_grey_levels
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
-
-ROUNDS = 2
-"""Passes of columns and stripes over one another; a third changed no figure of the reference scenes by .001."""
-
-VOTE_GAIN = 1.5
-"""Worth of the neighbours along a stripe, in votes of the peak itself."""
-
-POSTERIOR_FLOOR = 1e-4
-"""No vote against a stripe counts for more than this."""
-
-DECIDED = 0.9
-"""Posterior below which a peak stays undecided."""
-
-MIN_CHAIN_PX = 16
-"""Shorter pieces of stripe are left undecided: less than one period of a carrier, they have no code of their own."""
-
-SWITCH_COST = 6.0
-"""Natural logarithm of the odds against a change of stripe between two columns of one chain."""
 
 
 def decode_image(
@@ -102,11 +81,11 @@ def _by_what_is_known(
     found = locate(seen, model, camera, clock, known)
     if found.fault is not None:
         return None
-    decided = _decide(found, model, clock)
+    decided = decide(found, model, clock)
     if not decided.agreement.holds or not known.still_holds(_learnt(found, decided, upside_down=known.upside_down)):
         return None
-    decoded = _maps(seen, found, decided, model, clock)
-    return _upside_down(decoded) if known.upside_down else decoded, known
+    decoded = maps_of(seen, found, decided, model, clock)
+    return upside_down(decoded) if known.upside_down else decoded, known
 
 
 def _decode_anew(upright: Image, model: PatternModel, camera: CameraFormat) -> tuple[Decoded, Known]:
@@ -114,15 +93,15 @@ def _decode_anew(upright: Image, model: PatternModel, camera: CameraFormat) -> t
     found = locate(upright, model, camera, clock)
     if found.fault is not None:
         _explain(found, upright, model, camera)
-    decided = _decide(found, model, clock)
+    decided = decide(found, model, clock)
     if decided.agreement.holds:
-        return _maps(upright, found, decided, model, clock), _learnt(found, decided, upside_down=False)
+        return maps_of(upright, found, decided, model, clock), _learnt(found, decided, upside_down=False)
     # The projector may hang upside down: then the stripes' order is reversed.
     turned = np.ascontiguousarray(upright[::-1])
     found = locate(turned, model, camera, clock)
-    again = _decide(found, model, clock) if found.fault is None else decided
+    again = decide(found, model, clock) if found.fault is None else decided
     if again.agreement.holds:
-        return _upside_down(_maps(turned, found, again, model, clock)), _learnt(found, again, upside_down=True)
+        return upside_down(maps_of(turned, found, again, model, clock)), _learnt(found, again, upside_down=True)
     _refuse_turned(upright, model, camera)
     a = decided.agreement
     raise DecodeError(
@@ -132,10 +111,8 @@ def _decode_anew(upright: Image, model: PatternModel, camera: CameraFormat) -> t
     )
 
 
-def _learnt(found: Found, decided: _Decision, *, upside_down: bool) -> Known:
-    peaks, search = found.peaks, found.search
-    assert peaks is not None  # noqa: S101  (as in `_decide`)
-    assert search is not None  # noqa: S101
+def _learnt(found: Found, decided: Decision, *, upside_down: bool) -> Known:
+    peaks, _, _, search = found.parts()
     label = decided.label
     follow = (label[:-1] >= 0) & (label[1:] == label[:-1] + 1)
     spacing = np.diff(peaks.y)[follow]
@@ -222,57 +199,6 @@ class McpDecoder:
         return self._image if self._black is None else cv2.subtract(self._image, self._black)
 
 
-# --- the door -----------------------------------------------------------------------------------------------------
-
-
-def _check_frame(frame: NDArray[Any], camera: CameraFormat, position: int) -> None:
-    if frame.ndim != 2:
-        raise DecodeError(
-            f"frame {position} has shape {frame.shape}, expected one channel", hint="convert it to luma first"
-        )
-    if frame.shape != camera.shape:
-        raise DecodeError(
-            f"frame {position} is {frame.shape[1]} x {frame.shape[0]}, "
-            f"the camera's format is {camera.width} x {camera.height}"
-        )
-    if frame.dtype not in (np.uint8, np.uint16):
-        raise DecodeError(f"frame {position} has dtype {frame.dtype}, expected uint8 or uint16")
-
-
-_MOSAICS = {
-    "RGGB": cv2.COLOR_BayerRGGB2GRAY,
-    "BGGR": cv2.COLOR_BayerBGGR2GRAY,
-    "GRBG": cv2.COLOR_BayerGRBG2GRAY,
-    "GBRG": cv2.COLOR_BayerGBRG2GRAY,
-}
-
-
-def grey(image: NDArray[Any], camera: CameraFormat) -> Image:
-    """One channel of light: a colour camera's mosaic is interpolated.
-
-    Raises:
-        DecodeError: a mosaic that is not known.
-    """
-    if camera.mosaic is None:
-        return image
-    if camera.mosaic not in _MOSAICS:
-        raise DecodeError(f"unknown mosaic {camera.mosaic!r}", hint=f"known: {', '.join(sorted(_MOSAICS))}")
-    return np.asarray(cv2.cvtColor(image, _MOSAICS[camera.mosaic]))
-
-
-def upright_image(image: NDArray[Any], pattern: McpPattern, camera: CameraFormat) -> Image:
-    """Checked, grey, with horizontal stripes, contiguous."""
-    _check_frame(image, camera, 0)
-    image = grey(image, camera)
-    turned = image if pattern.axis == "y" else image.T
-    if min(turned.shape) < 32:
-        raise DecodeError(f"an image of {image.shape[1]} x {image.shape[0]} is smaller than a few stripes")
-    return np.ascontiguousarray(turned)
-
-
-# --- why not --------------------------------------------------------------------------------------------------------
-
-
 def _explain(found: Found, image: Image, model: PatternModel, camera: CameraFormat) -> None:
     """Raise what `locate` found wrong; a pattern turned by 90 degrees is named."""
     if found.pitch > 0:
@@ -284,180 +210,8 @@ def _refuse_turned(image: Image, model: PatternModel, camera: CameraFormat) -> N
     """Raise DecodeError if the pattern is there, codes and all, once the image is turned."""
     clock = Stages()
     found = locate(np.ascontiguousarray(image.T), model, camera, clock)
-    if found.fault is None and _decide(found, model, clock).agreement.holds:
+    if found.fault is None and decide(found, model, clock).agreement.holds:
         raise DecodeError(
             "the pattern is turned by 90 degrees: its stripes run the other way",
             hint='the other "axis" in the description, or turn projector or camera',
         )
-
-
-# --- which stripe is it -------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _Decision:
-    """label (P,) int32, -1 undecided; confidence (P,); light (P,); fine positions; figures for the report."""
-
-    label: NDArray[np.int32]
-    confidence: Array
-    light: Array
-    fine: subpixel.Fine
-    agreement: emissions.Agreement
-    magnification: float
-    figures: dict[str, Any]
-
-
-def _decide(found: Found, model: PatternModel, clock: Stages) -> _Decision:
-    peaks, chains, search, signals = found.peaks, found.chains, found.search, found.signals
-    assert peaks is not None  # noqa: S101  (no fault means that the search went to its end)
-    assert chains is not None  # noqa: S101
-    assert search is not None  # noqa: S101
-    assert signals is not None  # noqa: S101
-    size = magnification.window_px(model, search.scale)
-    shape = (found.reduced.shape[1], found.reduced.shape[0] * stripes.STEP)
-    with clock.stage("field"):
-        scale_field = magnification.fit_field(signals.light, peaks, chains, model, search, size, shape)
-    with clock.stage("emissions"):
-        seen = emissions.measure(signals.light, chains, scale_field, model, search.scale, size)
-    sites = linking.sites_of(peaks, chains)
-    here = seen.at(sites.index)
-    modulation = emissions.first_modulation(here, model)
-    floor = np.full(model.channels, 0.03, np.float32)
-    tables = hmm.transitions(model.stripes)
-    gap = hmm.gaps(sites.start, peaks.y[sites.index], peaks.height[sites.index], found.pitch, model.weakest)
-    votes = np.zeros((len(gap), model.stripes), np.float32)
-    posterior = votes
-    for _ in range(ROUNDS):
-        with clock.stage("emissions"):
-            evidence, stray_log = emissions.log_likelihood(here, model, modulation, floor)
-        with clock.stage("columns' model"):
-            posterior, _stray = hmm.smooth_columns(evidence + votes, sites.start, gap, tables, stray_log)
-        with clock.stage("votes"):
-            logs = linking.floored_log(posterior, POSTERIOR_FLOOR)
-            votes = linking.votes_along(logs, sites.chains, size / (4 * stripes.STEP), VOTE_GAIN)
-            modulation, floor = emissions.refined_modulation(here, model, posterior, modulation)
-    with clock.stage("columns' model"):
-        path = hmm.best_paths(evidence + votes, sites.start, gap, tables, stray_log)
-    with clock.stage("votes"):
-        along = linking.path_along(logs, sites.chains, SWITCH_COST)
-        sure = np.where(path >= 0, posterior[np.arange(len(path)), np.maximum(path, 0)], 0).astype(np.float32)
-        decided = np.where((path == along) & (sure >= DECIDED), path, -1).astype(np.int32)
-        label, confidence = linking.between_sites(decided, sure, sites, chains)
-        long_enough = np.repeat(chains.lengths * stripes.STEP >= MIN_CHAIN_PX, chains.lengths)
-        label[chains.order[~long_enough]] = -1
-        label[linking.silhouettes(found.reduced, peaks, chains)] = -1
-    with clock.stage("agreement"):
-        agrees = emissions.agreement(here, evidence, model, modulation, path, (sites.start, gap))
-    with clock.stage("sub-pixel"):
-        fine = subpixel.refine(found.reduced, peaks, chains, label, found.pitch)
-    figures = {
-        "pitch_px": round(found.pitch, 3),
-        "pitch_match": round(found.match, 3),
-        "noise_dn": round(found.noise, 3),
-        "carrier_scale": round(search.scale, 5),
-        "carrier_drift": [round(search.drift_x, 3), round(search.drift_y, 3)],
-        "carrier_contrast": [round(c, 2) for c in search.contrast],
-        "modulation": [round(float(m), 3) for m in modulation],
-        "noise_floor": [round(float(f), 4) for f in floor],
-        "window_px": size,
-        "agreement": {key: round(value, 4) for key, value in asdict(agrees).items()},
-        "peaks": len(peaks),
-        "peaks_decided": int((label >= 0).sum()),
-        "thresholds": {"decided": DECIDED, "min_chain_px": MIN_CHAIN_PX, "height_share": stripes.HEIGHT_FLOOR},
-    }
-    return _Decision(label, confidence, np.maximum(seen.light, 0), fine, agrees, float(np.median(scale_field)), figures)
-
-
-# --- maps ---------------------------------------------------------------------------------------------------------
-
-
-def _maps(image: Image, found: Found, decided: _Decision, model: PatternModel, clock: Stages) -> Decoded:
-    peaks, chains = found.peaks, found.chains
-    assert peaks is not None  # noqa: S101
-    assert chains is not None  # noqa: S101
-    keep = (decided.label >= 0) & (decided.fine.whole > 0) & (peaks.clear > 0)
-    label = np.where(keep, decided.label, -1).astype(np.int32)
-    row = ((label + 0.5) * model.pitch - 0.5).astype(np.float32)
-    counts = np.bincount(chains.column[keep], minlength=len(peaks.start) - 1)
-    slope = model.pitch / found.pitch
-    knots = dense.Knots(
-        np.concatenate(([0], np.cumsum(counts))).astype(np.int32),
-        decided.fine.y[keep],
-        row[keep],
-        (decided.fine.sigma[keep] * slope).astype(np.float32),
-        decided.confidence[keep],
-        decided.light[keep],
-        peaks.height[keep],
-        label[keep],
-    )
-    with clock.stage("dense rows"):
-        maps = dense.interpolate(knots, (image.shape[0], image.shape[1]), found.pitch, model.pitch)
-        marked = dense.stripe_map(decided.fine.y, label, chains, (image.shape[0], image.shape[1]))
-    with clock.stage("reasons"):
-        reason = _reasons(found, decided, maps.rows)
-    x = chains.column[keep] * float(stripes.STEP) + 1.5
-    peak_table = np.stack([x, knots.y, knots.row, knots.stripe, knots.confidence], axis=1).astype(np.float32)
-    warnings = []
-    if not len(peak_table):
-        warnings.append("no stripe could be decided: carriers are there, but too weak or too short")
-    figures = {
-        **decided.figures,
-        "peaks_kept": len(peak_table),
-        "stages_ms": {k: round(v, 2) for k, v in clock.ms.items()},
-    }
-    return Decoded(
-        rows=maps.rows,
-        columns=None,
-        sigma_rows=maps.sigma,
-        sigma_columns=None,
-        confidence=maps.confidence,
-        albedo=maps.albedo,
-        modulation=maps.modulation,
-        reason=reason,
-        stripes=marked,
-        peaks=peak_table,
-        warnings=tuple(warnings),
-        details=figures,
-    )
-
-
-def _upside_down(decoded: Decoded) -> Decoded:
-    """Turn maps back that were decoded from an image upside down."""
-    peaks = decoded.peaks
-    if peaks is not None:
-        peaks[:, 1] = decoded.confidence.shape[0] - 1 - peaks[:, 1]
-    return _with_maps(decoded, lambda array: array[::-1], details={**decoded.details, "upside_down": True})
-
-
-def turned_back(decoded: Decoded) -> Decoded:
-    """Rows of the turned image are columns of the image."""
-    peaks = decoded.peaks
-    if peaks is not None:
-        peaks[:, :2] = peaks[:, 1::-1]
-    upright = _with_maps(decoded, lambda array: array.T)
-    return replace(upright, rows=None, sigma_rows=None, columns=upright.rows, sigma_columns=upright.sigma_rows)
-
-
-def _with_maps(decoded: Decoded, change: Callable[[NDArray[Any]], NDArray[Any]], **more: Any) -> Decoded:
-    """`decoded` with every map changed, contiguous."""
-    names = ("rows", "sigma_rows", "confidence", "albedo", "modulation", "reason", "stripes")
-    changed: dict[str, Any] = {name: np.ascontiguousarray(change(getattr(decoded, name))) for name in names}
-    return replace(decoded, **changed, **more)
-
-
-def _reasons(found: Found, decided: _Decision, rows: Array) -> NDArray[np.uint8]:
-    """Why a pixel has no row: decided per column of four pixels by the nearest peak, (H, W) uint8."""
-    peaks, chains, signals = found.peaks, found.chains, found.signals
-    assert peaks is not None  # noqa: S101
-    assert chains is not None  # noqa: S101
-    assert signals is not None  # noqa: S101
-    why = np.full(len(peaks), np.uint8(Reason.BORDER))
-    why[decided.label < 0] = Reason.UNWRAP_RISK
-    why[signals.clipped > 0.5] = Reason.CLIPPED
-    # Without a peak: dark is shadow, bright is too little modulation.
-    half_lit = np.median(peaks.valley) + 0.5 * np.median(peaks.height)
-    small = np.where(half_lit < found.reduced, np.uint8(Reason.LOW_MODULATION), np.uint8(Reason.SHADOW))
-    dense.spread(chains.column, peaks.y, why, int(0.6 * found.pitch), small)
-    reason = np.empty(rows.shape, np.uint8)
-    dense.widen_reasons(small, rows, reason)
-    return reason

@@ -68,6 +68,14 @@ class Found:
     signals: carriers.Signals | None = None
     search: carriers.CarrierSearch | None = None
 
+    def parts(self) -> tuple[stripes.Peaks, linking.Chains, carriers.Signals, carriers.CarrierSearch]:
+        """What a search without a fault has found."""
+        assert self.peaks is not None  # noqa: S101  (no fault means that the search went to its end)
+        assert self.chains is not None  # noqa: S101
+        assert self.signals is not None  # noqa: S101
+        assert self.search is not None  # noqa: S101
+        return self.peaks, self.chains, self.signals, self.search
+
 
 @dataclass(frozen=True)
 class Known:

@@ -23,7 +23,8 @@ from scanner.decode.mcp.casey2011 import (
     stripe_detection,
 )
 from scanner.decode.mcp.casey2011.shown import Shown
-from scanner.decode.mcp.decoder import McpDecoder, turned_back, upright_image
+from scanner.decode.mcp.decoder import McpDecoder
+from scanner.decode.mcp.door import turned_back, upright_image
 from scanner.decode.mcp.locate import Stages
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.stages import Observer

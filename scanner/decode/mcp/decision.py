@@ -1,0 +1,111 @@
+"""Which stripe each peak is: emissions, the columns' model and the evidence along the stripes, in rounds.
+
+Not here: whether the pattern is there at all (`locate`), and what becomes of the decided peaks (`maps`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode.mcp import emissions, hmm, linking, magnification, stripes, subpixel
+from scanner.decode.mcp.locate import Array, Found, Stages
+from scanner.decode.mcp.model import PatternModel
+
+ROUNDS = 2
+"""Passes of columns and stripes over one another; a third changed no figure of the reference scenes by .001."""
+
+VOTE_GAIN = 1.5
+"""Worth of the neighbours along a stripe, in votes of the peak itself."""
+
+POSTERIOR_FLOOR = 1e-4
+"""No vote against a stripe counts for more than this."""
+
+DECIDED = 0.9
+"""Posterior below which a peak stays undecided."""
+
+MIN_CHAIN_PX = 16
+"""Shorter pieces of stripe are left undecided: less than one period of a carrier, they have no code of their own."""
+
+SWITCH_COST = 6.0
+"""Natural logarithm of the odds against a change of stripe between two columns of one chain."""
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """label (P,) int32, -1 undecided; confidence (P,); light (P,); fine positions; figures for the report."""
+
+    label: NDArray[np.int32]
+    confidence: Array
+    light: Array
+    fine: subpixel.Fine
+    agreement: emissions.Agreement
+    magnification: float
+    figures: dict[str, Any]
+
+
+def decide(found: Found, model: PatternModel, clock: Stages) -> Decision:
+    """Tell the stripes apart.
+
+    Args:
+        found: a search without a fault.
+        model: the pattern's tables.
+        clock: takes the stages' times.
+    """
+    peaks, chains, signals, search = found.parts()
+    size = magnification.window_px(model, search.scale)
+    shape = (found.reduced.shape[1], found.reduced.shape[0] * stripes.STEP)
+    with clock.stage("field"):
+        scale_field = magnification.fit_field(signals.light, peaks, chains, model, search, size, shape)
+    with clock.stage("emissions"):
+        seen = emissions.measure(signals.light, chains, scale_field, model, search.scale, size)
+    sites = linking.sites_of(peaks, chains)
+    here = seen.at(sites.index)
+    modulation = emissions.first_modulation(here, model)
+    floor = np.full(model.channels, 0.03, np.float32)
+    tables = hmm.transitions(model.stripes)
+    gap = hmm.gaps(sites.start, peaks.y[sites.index], peaks.height[sites.index], found.pitch, model.weakest)
+    votes = np.zeros((len(gap), model.stripes), np.float32)
+    posterior = votes
+    for _ in range(ROUNDS):
+        with clock.stage("emissions"):
+            evidence, stray_log = emissions.log_likelihood(here, model, modulation, floor)
+        with clock.stage("columns' model"):
+            posterior, _stray = hmm.smooth_columns(evidence + votes, sites.start, gap, tables, stray_log)
+        with clock.stage("votes"):
+            logs = linking.floored_log(posterior, POSTERIOR_FLOOR)
+            votes = linking.votes_along(logs, sites.chains, size / (4 * stripes.STEP), VOTE_GAIN)
+            modulation, floor = emissions.refined_modulation(here, model, posterior, modulation)
+    with clock.stage("columns' model"):
+        path = hmm.best_paths(evidence + votes, sites.start, gap, tables, stray_log)
+    with clock.stage("votes"):
+        along = linking.path_along(logs, sites.chains, SWITCH_COST)
+        sure = np.where(path >= 0, posterior[np.arange(len(path)), np.maximum(path, 0)], 0).astype(np.float32)
+        decided = np.where((path == along) & (sure >= DECIDED), path, -1).astype(np.int32)
+        label, confidence = linking.between_sites(decided, sure, sites, chains)
+        long_enough = np.repeat(chains.lengths * stripes.STEP >= MIN_CHAIN_PX, chains.lengths)
+        label[chains.order[~long_enough]] = -1
+        label[linking.silhouettes(found.reduced, peaks, chains)] = -1
+    with clock.stage("agreement"):
+        agrees = emissions.agreement(here, evidence, model, modulation, path, (sites.start, gap))
+    with clock.stage("sub-pixel"):
+        fine = subpixel.refine(found.reduced, peaks, chains, label, found.pitch)
+    figures = {
+        "pitch_px": round(found.pitch, 3),
+        "pitch_match": round(found.match, 3),
+        "noise_dn": round(found.noise, 3),
+        "carrier_scale": round(search.scale, 5),
+        "carrier_drift": [round(search.drift_x, 3), round(search.drift_y, 3)],
+        "carrier_contrast": [round(c, 2) for c in search.contrast],
+        "modulation": [round(float(m), 3) for m in modulation],
+        "noise_floor": [round(float(f), 4) for f in floor],
+        "window_px": size,
+        "agreement": {key: round(value, 4) for key, value in asdict(agrees).items()},
+        "peaks": len(peaks),
+        "peaks_decided": int((label >= 0).sum()),
+        "thresholds": {"decided": DECIDED, "min_chain_px": MIN_CHAIN_PX, "height_share": stripes.HEIGHT_FLOOR},
+    }
+    return Decision(label, confidence, np.maximum(seen.light, 0), fine, agrees, float(np.median(scale_field)), figures)
