@@ -115,20 +115,30 @@ def _traces(places: tuple[Path, Path]) -> Traces:
     )
 
 
+_strangers: set[str] = set()
+"""Processes that were looked at and are not ours: nobody becomes ours later, and looking is what takes the time"""
+
+
 def _processes() -> Iterator[str]:
     """Living processes that are children of this one or bear the session's mark."""
     me = str(os.getpid())
-    for folder in Path("/proc").iterdir():
-        if not folder.name.isdigit() or folder.name == me:
-            continue
+    living = {entry.name for entry in os.scandir("/proc") if entry.name.isdigit()} - {me}
+    _strangers.intersection_update(living)
+    for name in living - _strangers:
+        folder = Path("/proc", name)
         try:
             # The name in brackets may hold blanks; state and parent follow the last bracket.
             state, parent = (folder / "stat").read_text().rpartition(")")[2].split()[:2]
             marked = MARK.encode() in (folder / "environ").read_bytes().split(b"\0")
             command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+        except PermissionError:
+            _strangers.add(name)  # another user's
+            continue
         except (OSError, ValueError):
-            continue  # it ended while we looked, or belongs to somebody else
-        if state != "Z" and (marked or parent == me) and not any(name in command for name in LONG_LIVED):
+            continue  # it ended while we looked
+        if not marked and parent != me:
+            _strangers.add(name)
+        elif state != "Z" and not any(name in command for name in LONG_LIVED):
             yield f"{folder.name} ({command[:120]})"
 
 
