@@ -10,13 +10,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanner.clock import Clock
-from scanner.geometry import Calibration
+
+if TYPE_CHECKING:  # its kernels take a while to load, and few devices know their own geometry
+    from scanner.geometry import Calibration
 
 Image = NDArray[np.uint8]
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
