@@ -24,8 +24,8 @@ from scanner.devices import Pixels, Truth
 from scanner.errors import CalibrationError, DecodeError
 from scanner.filters import FilterSettings
 from scanner.geometry import Calibration, load_calibration
-from scanner.orientation import require_orientation
 from scanner.patterns import McpPattern, PatternSequence, PmpPattern
+from scanner.scale_check import require_codes_within, require_geometry
 from scanner.scan import Scan, build_scan
 from scanner.sequencer import check_capture
 
@@ -130,10 +130,11 @@ class Reconstruction:
         self._catch_up(capture)
         tell("decoding")
         decoded = self._decoded()
+        require_codes_within(decoded, self._header.sequence)
         if len(self._header.sequence) > 1:
             # The witnesses have seen light: without it the check ends in an error of its own.
             raise_if_empty(decoded)
-        decoded = self._carriers_fit(self._oriented(decoded), capture)
+        decoded = self._carriers_fit(self._fits_geometry(decoded), capture)
         tell("triangulating")
         scan = build_scan(decoded, self._calibration, self._options.filters, timings=self._timings)
         scan = scan.with_report(sync=check.as_dict(), capture=self._capture_report(capture))
@@ -167,15 +168,12 @@ class Reconstruction:
         said += [f"{absent} of {self._header.repeat} repetitions have no frames"] if absent else []
         return replace(decoded, warnings=(*decoded.warnings, *said)) if said else decoded
 
-    def _oriented(self, decoded: Decoded) -> Decoded:
+    def _fits_geometry(self, decoded: Decoded) -> Decoded:
+        """Coordinates run the way, and at the pace, that a calibrated rig lets them; see `scale_check`."""
         if self._calibration is None:
             return decoded
-        said = [
-            warning
-            for axis, values in (("y", decoded.rows), ("x", decoded.columns))
-            if values is not None and (warning := require_orientation(self._calibration, values, axis)) is not None
-        ]
-        return replace(decoded, warnings=(*decoded.warnings, *said)) if said else decoded
+        with self._timed("check geometry"):
+            return require_geometry(decoded, self._calibration, self._header.sequence)
 
     def _carriers_fit(self, decoded: Decoded, capture: Capture) -> Decoded:
         """MCP on a calibrated rig: the carriers' frequencies agree with the stripes' names; see `carrier_check`."""

@@ -55,6 +55,10 @@ LEAST_WEIGHT = 0.2
 ROUGHNESS_GAIN = 0.8
 """Another order is believed when positions are rougher by no more than this share of what they are as it is."""
 
+MOST_BEYOND = 0.1
+"""Share of positions off the projector above which no order is the right one: it is the description that is wrong, and
+decoding says so (`scanner.scale_check`)."""
+
 
 def gray_witnesses(scene: Scene, cannot: list[str]) -> list[Witness]:
     """All witnesses of a Gray or binary code capture."""
@@ -279,6 +283,9 @@ def _smoothness(scene: Scene, code: _Code, orders: tuple[Order, ...], cannot: li
     name = f"code order {code.axis}"
     if best >= ROUGHNESS_GAIN * here:
         return [Witness(name, True, here, best / ROUGHNESS_GAIN, says="positions are smoothest in this order")]
+    if np.mean((code.values(order, triples) >= code.cells).any(axis=1)) > MOST_BEYOND:
+        cannot.append(f"code frames along {code.axis} in another order (in all of them the code leaves the projector)")
+        return []
     frames = _named(code, order)
     says = (
         f"positions along {code.axis} are broken as they are and smooth with frames {listed(frames)} {order.says} "
