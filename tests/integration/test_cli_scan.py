@@ -20,12 +20,12 @@ from service.cli import main
 
 FRINGED = (sys.executable, "-c", "import sys; from service.cli import main; sys.exit(main())")
 SCAN_FILES = {"scan.npz", "cloud.ply", "preview.png", "report.json", "capture"}
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 
 
 def fringed(*words: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [*FRINGED, *map(str, words)], capture_output=True, text=True, check=False, timeout=2 * PATIENCE_S
+        [*FRINGED, *map(str, words)], capture_output=True, text=True, check=False, timeout=PATIENCE_S
     )
 
 
