@@ -54,6 +54,8 @@ def figures(folder: Path, gray: str | None) -> dict[str, Any]:
         told |= depths(scan, calibration, axis, reference)
     if gray is not None:
         told["gray"] = beside_gray(folder / gray, calibration, axis, ours, scan, known)
+        if calibration is not None:
+            told["gray"]["of_our_deepest_hundredth"] = deepest(folder / gray, calibration, axis, scan, known)
     return told
 
 
@@ -89,6 +91,21 @@ def beside_gray(
             "on_its_pixels": float(np.mean(apart[both & known] > 20)),
             "elsewhere": float(np.mean(apart[both & ~known] > 20)),
         },
+    }
+
+
+def deepest(path: Path, calibration: Calibration, axis: str, scan: Scan, known: NDArray[np.bool_]) -> dict[str, float]:
+    """Whether what lies at the far end of our depths is there: its share on the reference's pixels, and Gray code."""
+    assert scan.xyz is not None
+    z = scan.xyz[..., 2]
+    far = z > np.nanpercentile(z, 99)
+    code = getattr(reconstruct(Capture.open(path), calibration), axis)
+    apart = np.abs(code - getattr(scan, axis))[far & np.isfinite(code)]
+    return {
+        "on_its_pixels": share(far & known, far),
+        "gray_has": float(apart.size / far.sum()),
+        "median_px": float(np.median(apart)),
+        "beyond_20_px": float(np.mean(apart > 20)),
     }
 
 
