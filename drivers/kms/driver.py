@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from drivers.display import DisplayOptions
 from drivers.kms.card import cards, driver_name, find, open_card, outputs
-from drivers.kms.options import KmsOptions
 from drivers.kms.projector import KmsProjector
 from drivers.option_table import read_options
 from scanner.clock import Clock
@@ -17,11 +17,11 @@ DRIVER = "kms"
 
 
 class KmsProjectorDriver:
-    """Entry point of the group `fringed.projectors`. Device strings: see `card.find`; options: `KmsOptions`."""
+    """Entry point of the group `fringed.projectors`. Device strings: see `card.find`; options: `DisplayOptions`."""
 
     def open(self, device: str, options: Mapping[str, Any], clock: Clock) -> KmsProjector:
         """Open one output; see `scanner.devices.ProjectorDriver.open`."""
-        understood = read_options(KmsOptions, options, device or DRIVER)
+        understood = read_options(DisplayOptions, options, device or DRIVER)
         node, output = find(device)
         return KmsProjector(node, output, understood, clock)
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from drivers.ioctl import Node, device_error
 from drivers.kms import drm
 from scanner.devices import Image
-from scanner.errors import DeviceError
 
 _OPAQUE, _GREY = 0xFF000000, 0x00010101
 
@@ -72,13 +71,3 @@ class DumbBuffer:
         mapping = mmap.mmap(self._node.fd, made.size, offset=offset)
         lines = np.frombuffer(mapping, dtype=np.uint32, count=made.pitch // 4 * self.height)
         return lines.reshape(self.height, made.pitch // 4)[:, : self.width]
-
-
-def check_image(image: Image, shape: tuple[int, int], place: int, device: str) -> None:
-    """Raise DeviceError unless an image is (height, width) uint8 of that shape."""
-    if image.shape != shape or image.dtype != np.uint8:
-        raise DeviceError(
-            f"image {place} is {image.dtype} of shape {image.shape}, expected uint8 of shape {shape}",
-            device=device,
-            hint="images are (height, width) uint8 in the projector's own size",
-        )

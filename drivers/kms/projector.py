@@ -14,14 +14,14 @@ import os
 import select
 from collections.abc import Sequence
 
+from drivers.display import DisplayOptions, check_images
 from drivers.ioctl import Node, device_error
 from drivers.kms import drm
 from drivers.kms.card import Mode, Output, connected, mode_info, resources, take_master
-from drivers.kms.framebuffer import DumbBuffer, check_image
-from drivers.kms.options import KmsOptions
+from drivers.kms.framebuffer import DumbBuffer
 from drivers.kms.properties import make_exact
 from scanner.clock import Clock
-from scanner.devices import Flip, Image, ProjectorCapabilities, ProjectorKind, Source
+from scanner.devices import Flip, Image, ProjectorCapabilities, Source
 from scanner.errors import ConfigError, DeviceError, DeviceLost
 
 STAMP_BOUND_NS = 21_000
@@ -36,7 +36,7 @@ RATE_TOLERANCE = 2e-4
 class KmsProjector:
     """See `scanner.devices.Projector`. Owns the node that it is given."""
 
-    def __init__(self, node: Node, output: Output, options: KmsOptions, clock: Clock) -> None:
+    def __init__(self, node: Node, output: Output, options: DisplayOptions, clock: Clock) -> None:
         """Become master, set the mode, show black, and look whether the display counts its blanks.
 
         Raises:
@@ -104,22 +104,13 @@ class KmsProjector:
     @property
     def capabilities(self) -> ProjectorCapabilities:
         """What it can do."""
-        period = self._options.modulation_period_us
-        return ProjectorCapabilities(
-            kind=ProjectorKind.FRAMEBUFFER,
-            width=self._mode.width,
-            height=self._mode.height,
-            refresh_ns=self._refresh_ns,
-            modulation_period_ns=None if period is None else round(1e3 * period),
-            scan=self._options.scan,
-        )
+        return self._options.capabilities(self._mode.width, self._mode.height, self._refresh_ns)
 
     def load(self, images: Sequence[Image]) -> None:
         """Replace the images; what is on show stays until the next `show`. See `scanner.devices.Projector.load`."""
         self._check_open()
         shape = (self._mode.height, self._mode.width)
-        for place, image in enumerate(images):
-            check_image(image, shape, place, self._name)
+        check_images(images, shape, self._name)
         spare = [buffer for buffer in self._images if buffer is not self._shown]
         loaded: list[DumbBuffer] = []
         try:

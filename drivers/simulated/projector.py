@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from drivers.display import check_images
 from drivers.simulated.faults import Allowance, displayed_index
 from drivers.simulated.gige_light import LightRelay
 from drivers.simulated.lines import Recorded, Regular
@@ -99,13 +100,7 @@ class SimulatedProjector:
         """Replace the images; see `scanner.devices.Projector.load`."""
         self._check_open()
         shape = (self._capabilities.height, self._capabilities.width)
-        for i, image in enumerate(images):
-            if image.shape != shape or image.dtype != np.uint8:
-                raise DeviceError(
-                    f"image {i} is {image.dtype} of shape {image.shape}, expected uint8 of shape {shape}",
-                    device=self._name,
-                    hint="images are (height, width) uint8 in the projector's own size",
-                )
+        check_images(images, shape, self._name)
         if self._capabilities.kind is ProjectorKind.STATIC and len(images) > 1:
             raise DeviceError(f"a static projector holds one image, got {len(images)}", device=self._name)
         if len(set(self._shown)) >= LEAST_SEQUENCE:

@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
+from drivers.display import DisplayOptions
 from drivers.option_table import Options
 
 MicrosecondSpan = tuple[float, float]
@@ -43,13 +44,9 @@ class CameraOptions(Options):
         return self
 
 
-class OutputOptions(Options):
-    """`projector.options` of a V4L2 output; `mode` comes from the rig file's `projector.mode`."""
+class OutputOptions(DisplayOptions):
+    """`projector.options` of a V4L2 output."""
 
-    mode: str | None = None
     pixel_format: str | None = None
     stamp_bound_us: float | None = Field(default=None, gt=0, le=1e6)
     """measured: a flip's stamp is true within this; without it stamps are estimates, true within a refresh"""
-    modulation_period_us: float | None = Field(default=None, gt=0, le=1e6)
-    """of a display that builds a grey over time (colour wheel, bit planes)"""
-    scan: Literal["global", "rows"] = "global"

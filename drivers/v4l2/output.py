@@ -12,12 +12,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from drivers.display import check_images
 from drivers.v4l2 import formats, timings
 from drivers.v4l2.node import VideoNode, open_node
 from drivers.v4l2.options import OutputOptions
 from drivers.v4l2.queue import SLICE_MS, BufferQueue, Dequeued
 from scanner.clock import Clock
-from scanner.devices import Flip, Image, ProjectorCapabilities, ProjectorKind, Source
+from scanner.devices import Flip, Image, ProjectorCapabilities, Source
 from scanner.errors import ConfigError, DeviceError
 
 BUFFERS = 4
@@ -72,27 +73,13 @@ class V4l2Output:
     @property
     def capabilities(self) -> ProjectorCapabilities:
         """What it can do."""
-        period = self._options.modulation_period_us
-        return ProjectorCapabilities(
-            kind=ProjectorKind.FRAMEBUFFER,
-            width=self._format.width,
-            height=self._format.height,
-            refresh_ns=self._period_ns,
-            modulation_period_ns=None if period is None else round(1e3 * period),
-            scan=self._options.scan,
-        )
+        return self._options.capabilities(self._format.width, self._format.height, self._period_ns)
 
     def load(self, images: Sequence[Image]) -> None:
         """Replace the images; see `scanner.devices.Projector.load`."""
         self._require_queue().check_alive()
         shape = (self._format.height, self._format.width)
-        for i, image in enumerate(images):
-            if image.shape != shape or image.dtype != np.uint8:
-                raise DeviceError(
-                    f"image {i} is {image.dtype} of shape {image.shape}, expected uint8 of shape {shape}",
-                    device=self._name,
-                    hint="images are (height, width) uint8 in the projector's own size",
-                )
+        check_images(images, shape, self._name)
         self._images = [image.copy() for image in images]
 
     def show(self, index: int) -> Flip:

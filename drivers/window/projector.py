@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
-from drivers.option_table import Options, read_options
+from drivers.display import DisplayOptions, check_images
+from drivers.option_table import read_options
 from drivers.window import sdl
 from scanner.clock import Clock
-from scanner.devices import DeviceInfo, Flip, Image, ProjectorCapabilities, ProjectorKind, Source
+from scanner.devices import DeviceInfo, Flip, Image, ProjectorCapabilities, Source
 from scanner.errors import ConfigError, DeviceError, DeviceLost, DeviceNotFound
 
 DRIVER = "window"
@@ -27,16 +27,11 @@ COMPOSITOR_REFRESHES = 2
 """Between the call and scan-out there may lie one refresh for the compositor's drawing and one for its flip"""
 
 
-class WindowOptions(Options):
-    """`projector.options` of a window."""
+class WindowOptions(DisplayOptions):
+    """`projector.options` of a window; `mode` is checked against the desktop's, which this driver does not change."""
 
-    mode: str | None = None
-    """the rig file's `projector.mode`: checked against the desktop's, which this driver does not change"""
     windowed: tuple[int, int] | None = None
     """width and height of a window that leaves the rest of the desktop free, for trials"""
-    modulation_period_us: float | None = Field(default=None, gt=0, le=1e6)
-    """of a display that builds a grey over time (colour wheel, bit planes)"""
-    scan: Literal["global", "rows"] = "global"
 
 
 class WindowProjector:
@@ -90,26 +85,12 @@ class WindowProjector:
     @property
     def capabilities(self) -> ProjectorCapabilities:
         """What it can do."""
-        period = self._options.modulation_period_us
-        return ProjectorCapabilities(
-            kind=ProjectorKind.FRAMEBUFFER,
-            width=self._size[0],
-            height=self._size[1],
-            refresh_ns=self._refresh_ns,
-            modulation_period_ns=None if period is None else round(1e3 * period),
-            scan=self._options.scan,
-        )
+        return self._options.capabilities(*self._size, self._refresh_ns)
 
     def load(self, images: Sequence[Image]) -> None:
         """Replace the images; see `scanner.devices.Projector.load`."""
         window, shape = self.window, self._size[::-1]
-        for place, image in enumerate(images):
-            if image.shape != shape or image.dtype != np.uint8:
-                raise DeviceError(
-                    f"image {place} is {image.dtype} of shape {image.shape}, expected uint8 of shape {shape}",
-                    device=self._name,
-                    hint="images are (height, width) uint8 in the display's own size",
-                )
+        check_images(images, shape, self._name)
         before, self._pictures = self._pictures, []
         for picture in before:
             picture.free()

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.display import check_images
 from drivers.kms import card, drm, projector_driver
 from drivers.kms.card import Mode, Output, mode_info
-from drivers.kms.framebuffer import check_image
 from drivers.kms.projector import choose_mode
 from drivers.registry import open_projector
 from scanner.clock import VirtualClock
@@ -93,7 +93,8 @@ def test_a_machine_without_cards_says_so(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 
 def test_images_of_another_size_or_kind_are_refused() -> None:
-    check_image(np.zeros((4, 6), dtype=np.uint8), (4, 6), 0, "x")
+    good = np.zeros((4, 6), dtype=np.uint8)
+    check_images([good], (4, 6), "x")
     for image in (np.zeros((4, 5), dtype=np.uint8), np.zeros((4, 6), dtype=np.uint16)):
-        with pytest.raises(DeviceError, match="image 3"):
-            check_image(image, (4, 6), 3, "x")
+        with pytest.raises(DeviceError, match="image 1"):
+            check_images([good, image], (4, 6), "x")
