@@ -10,8 +10,8 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,72 +21,7 @@ from scanner.client import AsyncClient, Client
 from scanner.errors import DecodeError, DeviceLost, Unreachable
 from service.config import load_rig
 from service.daemon import Daemon
-
-RIG = "simulated:quick/board"
-
-
-class RunningDaemon:
-    """A daemon process on a state folder that outlives it."""
-
-    def __init__(self, state: Path, workers: int = 1) -> None:
-        rig = load_rig(RIG)
-        rig = rig.model_copy(update={"daemon": rig.daemon.model_copy(update={"workers": workers})})
-        state.mkdir(exist_ok=True)
-        (state / "rig.toml").write_text(rig.as_toml())
-        self.endpoint = f"ipc://{state}/control.ipc"
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "service.daemon", "--config", state / "rig.toml", "--private", state, "--lifeline"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline() == b"ready\n"
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.end()
-
-    def end(self) -> None:
-        for pipe in (self.process.stdin, self.process.stdout):
-            assert pipe is not None
-            pipe.close()
-        self.process.wait(10)
-
-
-@pytest.fixture
-def daemon(tmp_path: Path) -> Iterator[Callable[..., RunningDaemon]]:
-    running: list[RunningDaemon] = []
-
-    def start(**options: Any) -> RunningDaemon:
-        running.append(RunningDaemon(tmp_path / "state", **options))
-        return running[-1]
-
-    yield start
-    for each in running:
-        each.end()
-    wait_for(lambda: not any(children(each.process.pid) for each in running))
-
-
-def children(daemon_pid: int, module: str = "") -> list[int]:
-    """Processes that a daemon started, of one module or all."""
-    found = []
-    for folder in Path("/proc").iterdir():
-        with suppress(OSError, ValueError, IndexError):
-            command = (folder / "cmdline").read_bytes()
-            stat = (folder / "stat").read_text().rpartition(")")[2].split()
-            if module.encode() in command and int(stat[1]) == daemon_pid and stat[0] != "Z":
-                found.append(int(folder.name))
-    return found
-
-
-def wait_for(true: Callable[[], Any], timeout_s: float = 30.0) -> Any:
-    deadline = time.monotonic() + timeout_s
-    while not (found := true()):
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
-    return found
+from tests.faults.daemons import RIG, RunningDaemon, children, wait_for
 
 
 def wait_for_event(client: Client, job: str, kind: str) -> None:

@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,63 +14,10 @@ from scanner.client import Client
 from scanner.errors import DeviceLost, StorageError
 from scanner.live import LiveFrame
 from scanner.series import read_series
-from service.config import load_rig
+from tests.faults.daemons import RunningDaemon, children, wait_for
 
 RIG = "simulated:quick/board?ring=6&period_us=16667&modulation=none"
 SHORT = {"exposure": 15_000.0}
-
-
-class RunningDaemon:
-    """A daemon process on a state folder that outlives it."""
-
-    def __init__(self, state: Path, rig: str = RIG, **daemon: Any) -> None:
-        config = load_rig(rig)
-        config = config.model_copy(update={"daemon": config.daemon.model_copy(update=daemon)})
-        state.mkdir(exist_ok=True)
-        (state / "rig.toml").write_text(config.as_toml())
-        self.endpoint = f"ipc://{state}/control.ipc"
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "service.daemon", "--config", state / "rig.toml", "--private", state, "--lifeline"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline() == b"ready\n"
-
-    def end(self) -> None:
-        for pipe in (self.process.stdin, self.process.stdout):
-            assert pipe is not None
-            pipe.close()
-        self.process.wait(15)
-
-
-@pytest.fixture
-def daemon(tmp_path: Path) -> Iterator[Callable[..., RunningDaemon]]:
-    running: list[RunningDaemon] = []
-
-    def start(**options: Any) -> RunningDaemon:
-        running.append(RunningDaemon(tmp_path / "state", **options))
-        return running[-1]
-
-    yield start
-    for each in running:
-        each.end()
-    assert not [path for path in (tmp_path / "state").iterdir() if path.suffix == ".ipc"]
-
-
-def child(daemon_pid: int, module: str) -> int:
-    """The process of that module that a daemon started."""
-    deadline = time.monotonic() + 10
-    while time.monotonic() < deadline:
-        for folder in Path("/proc").iterdir():
-            with suppress(OSError, ValueError, IndexError):
-                stat = (folder / "stat").read_text().rpartition(")")[2].split()
-                if module.encode() in (folder / "cmdline").read_bytes() and int(stat[1]) == daemon_pid:
-                    return int(folder.name)
-        time.sleep(0.02)
-    raise AssertionError(f"no {module}")
 
 
 def until(frames: Iterator[LiveFrame], number: int) -> LiveFrame:
@@ -88,7 +30,7 @@ def until(frames: Iterator[LiveFrame], number: int) -> LiveFrame:
 def test_worker_devices_and_daemon_go_away_one_after_the_other(
     daemon: Callable[..., RunningDaemon], tmp_path: Path
 ) -> None:
-    running = daemon()
+    running = daemon(rig=RIG)
     with Client(running.endpoint) as client:
         # The worker is killed: another one goes on, in the same run, at the same socket.
         run = client.live_start(**SHORT)["id"]
@@ -107,7 +49,7 @@ def test_worker_devices_and_daemon_go_away_one_after_the_other(
         run = client.live_start(retain="record", **SHORT)["id"]
         frames = client.live_frames(run)
         until(frames, 10)
-        os.kill(child(running.process.pid, "devices_process"), signal.SIGKILL)
+        os.kill(wait_for(lambda: children(running.process.pid, "devices_process"))[0], signal.SIGKILL)
         with pytest.raises(DeviceLost, match="devices process died"):
             until(frames, 10**6)
         outcome = client.wait(run)
@@ -121,7 +63,7 @@ def test_worker_devices_and_daemon_go_away_one_after_the_other(
         until(client.live_frames(run), 10)
         running.process.kill()
     running.end()
-    running = daemon()
+    running = daemon(rig=RIG)
     with Client(running.endpoint) as client:
         outcome = client.wait(run)
         assert (outcome["state"], outcome["reason"]) == ("done", "daemon_restarted")
