@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from scanner.capture import Capture, CaptureHeader
+from scanner.capture.exposure import exposure_report, exposure_warnings
 from scanner.carrier_check import require_carriers
 from scanner.compare import compare
 from scanner.decode import Decoded, Decoder, Reason, decoder_for
@@ -166,6 +167,7 @@ class Reconstruction:
         absent = self._header.repeat - self._repetitions.count - len(self._failed)
         said = [f"repetition {n + 1} was left out: {error}" for n, error in sorted(self._failed.items())]
         said += [f"{absent} of {self._header.repeat} repetitions have no frames"] if absent else []
+        said += exposure_warnings(self._header)
         return replace(decoded, warnings=(*decoded.warnings, *said)) if said else decoded
 
     def _fits_geometry(self, decoded: Decoded) -> Decoded:
@@ -215,6 +217,7 @@ class Reconstruction:
             "state": header.state,
             "reason": header.reason,
             "repeat": header.repeat,
+            "exposure": exposure_report(header),
         }
 
     def _compared(self, scan: Scan, capture: Capture) -> Scan:

@@ -179,6 +179,7 @@ class Scan:
             return self._auto_exposure_ns()
         if not 0 < wanted <= 10_000_000:
             raise ConfigError(f"exposure {wanted:g} us is outside 0 .. 10 s", hint='give microseconds, or "auto"')
+        self._exposure = {"mode": "given", "asked_us": wanted}
         return round(wanted * 1000)
 
     def _auto_exposure_ns(self) -> int:

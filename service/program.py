@@ -97,7 +97,7 @@ def _run(words: list[str], as_json: bool) -> int:
     except _UsageError as error:
         context = getattr(error, "ctx", None)
         path = context.command_path if context is not None else "fringed"
-        message = error.format_message().removeprefix("Invalid value: ")
+        message = error.format_message().removeprefix("Invalid value: ").replace("Value error, ", "")
         print_error(message, f"{path} --help")
         if as_json:
             print_json({"error": {"code": WRONG_USAGE, "message": message, "class": "UsageError"}})

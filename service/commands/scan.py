@@ -215,9 +215,9 @@ def _follower(folder: Path, lines: ProgressLines) -> Callable[[Event], None]:
                     total, total, f"{total} frames; {_counted(fields.get('retakes'))} taken again: out of step"
                 )
             case "acquired":
-                lines.stage("decoding")
+                lines.stage("reading frames")
             case "decoding":
-                stage = str(fields.get("stage") or "decoding")
+                stage = str(fields.get("stage") or "reading frames")
                 lines.stage("writing files" if stage.startswith("wrote ") else stage)
 
     return follow

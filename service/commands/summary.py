@@ -48,6 +48,9 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         kept = coverage.get("points_of_lit") if report.get("depth_mm") or report.get("removed") else None
         points = f", {kept:.1%} keep a point" if kept is not None and round(kept, 3) != round(lit, 3) else ""
         facts.append(("coverage", f"{lit:.1%} of lit pixels{points}"))
+    exposure = (report.get("capture") or {}).get("exposure") or {}
+    if (used := exposure.get("used_us")) is not None:
+        facts.append(("exposure", f"{used / 1000:.3f} ms{', chosen by test shots' * (exposure.get('mode') == 'auto')}"))
     spread = report.get("depth_mm") or {}
     if (near := spread.get("p1")) is not None and (far := spread.get("p99")) is not None:
         facts.append(("depth", f"{near:.1f} .. {far:.1f} mm (1st to 99th percentile)"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -21,6 +22,7 @@ from scanner.capture import (
     close_interrupted,
     digest,
 )
+from scanner.capture.exposure import exposure_report, exposure_warnings
 from scanner.devices import Exposure, Flip, Source
 from scanner.errors import DecodeError, StorageError
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
@@ -303,3 +305,18 @@ def test_no_folder_and_no_json_are_named(tmp_path: Path) -> None:
     (tmp_path / "capture.json").write_text("{")
     with pytest.raises(DecodeError, match="not JSON"):
         Capture.open(tmp_path)
+
+
+def test_the_exposure_that_was_used_is_told_and_warned_of_where_it_is_another() -> None:
+    plan = {"exposure_ns": 4_167_000, "why": {"exposure_ns": "one modulation period"}}
+    given = replace(header(), plan=plan, extra={"exposure": {"mode": "given", "asked_us": 1.0}})
+    assert exposure_report(given) == {"mode": "given", "asked_us": 1.0, "used_us": 4167.0}
+    (warning,) = exposure_warnings(given)
+    assert warning == "exposed for 4167 us and not 1 us as asked: one modulation period"
+    assert exposure_warnings(replace(given, extra={"exposure": {"mode": "given", "asked_us": 4150.0}})) == ()
+    shots = replace(given, extra={"exposure": {"mode": "auto", "warning": "full white saturates"}})
+    assert exposure_warnings(shots) == ("full white saturates",)
+    # Made elsewhere, or by somebody who lies.
+    assert exposure_report(header()) is None
+    for told in (None, 3, {"warning": 5, "asked_us": "long"}):
+        assert exposure_warnings(replace(given, extra={"exposure": told})) == ()
