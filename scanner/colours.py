@@ -63,6 +63,7 @@ def scale_of(values: NDArray[Any], colours: ColourMap, unit: str = "", *, revers
 def fit(values: NDArray[Any], width: int, height: int) -> NDArray[np.float32]:
     """A map reduced to fit into width x height, proportions kept; a pixel is missing where most of its area is.
 
+    Where the map has values on lines only (the peaks of stripes), it is missing where the lines are.
     Small maps are enlarged pixel by pixel, by a whole factor if that fits.
     """
     factor = min(width / values.shape[1], height / values.shape[0])
@@ -76,8 +77,9 @@ def fit(values: NDArray[Any], width: int, height: int) -> NDArray[np.float32]:
     filled = np.where(there, values, 0).astype(np.float32)
     total = cv2.resize(filled, size, interpolation=cv2.INTER_AREA)
     weight = cv2.resize(there.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    usual = float(np.median(weight[weight > 0])) if there.any() else 1.0
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(weight > 0.5, total / weight, np.nan).astype(np.float32)
+        return np.where(weight > 0.5 * usual, total / weight, np.nan).astype(np.float32)
 
 
 def ticks(low: float, high: float, most: int = 6) -> list[float]:

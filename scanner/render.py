@@ -1,8 +1,9 @@
 """A shaded view of an organised cloud from the side: a mesh over the camera's grid, a z-buffer, two lights.
 
-Every quad of four neighbouring points becomes two triangles; the z-buffer keeps for each sub-pixel which place of the
-camera's grid it sees, and the shading, made once on that grid, is looked up there. Shading uses smoothed normals and
-darkens what lies behind its surroundings (Luft, Colditz, Deussen 2006, unsharp masking of the depth buffer).
+Every quad of four neighbouring points becomes two triangles, a point of no quad a dot; the z-buffer keeps for each
+sub-pixel which place of the camera's grid it sees, and the shading, made once on that grid, is looked up there. Shading
+uses smoothed normals and darkens what lies behind its surroundings (Luft, Colditz, Deussen 2006, unsharp masking of the
+depth buffer).
 It is a picture for people; no measurement is taken from it.
 """
 
@@ -25,6 +26,9 @@ Map = NDArray[np.float32]
 SUPERSAMPLING = 2
 MAX_VERTICES = 1_600_000
 """Larger grids are thinned: the picture has no more pixels than this."""
+
+DOT = 2
+"""Side of the square that stands for a point without neighbours, px."""
 
 _FOV = math.radians(24)
 """Angle of view of the picture's height: long enough a lens for calm perspective."""
@@ -61,7 +65,9 @@ def render(xyz: Map, albedo: Map, size: tuple[int, int], view: View | None = Non
     fine = (size[1] * SUPERSAMPLING, size[0] * SUPERSAMPLING)
     depth = np.full(fine, np.inf, np.float32)
     place = np.full((2, *fine), -9, np.float32)  # outside the grid: black
-    _rasterise(grid, screen, _footprint(grid) * _LONGEST, depth, place)
+    alone = ~np.isnan(grid[..., 2])
+    _rasterise(grid, screen, _footprint(grid) * _LONGEST, depth, place, alone)
+    _dots(screen, alone, DOT * SUPERSAMPLING, depth, place)
     colour = cv2.remap(_shade(grid, tone, rotation), place[0], place[1], cv2.INTER_LINEAR)
     there = np.isfinite(depth)
     cover = cv2.resize(there.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA)[..., None]
@@ -74,7 +80,9 @@ def render(xyz: Map, albedo: Map, size: tuple[int, int], view: View | None = Non
 def warm_up() -> None:
     """Compile the kernel."""
     xyz = np.ones((2, 2, 3), np.float32)
-    _rasterise(xyz, xyz, 1.0, np.ones((2, 2), np.float32), np.zeros((2, 2, 2), np.float32))
+    depth, place, alone = np.ones((2, 2), np.float32), np.zeros((2, 2, 2), np.float32), np.ones((2, 2), np.bool_)
+    _rasterise(xyz, xyz, 1.0, depth, place, alone)
+    _dots(xyz, alone, 1, depth, place)
 
 
 def _in_view(grid: Map, size: tuple[int, int], view: View) -> tuple[Map, NDArray[np.float64], float] | None:
@@ -145,7 +153,9 @@ def _footprint(grid: Map) -> float:
 
 def _shade(grid: Map, albedo: Map, rotation: NDArray[np.float64]) -> Picture:
     """(H, W, 3) uint8 BGR on the camera's grid: a clay surface under two lights and a sky."""
-    normals = _smooth(normals_of(grid)) @ rotation.T.astype(np.float32)
+    normals = _smooth(normals_of(grid))
+    normals[~normals.any(axis=-1)] = (0, 0, -1)  # none: as if it faced the camera
+    normals = normals @ rotation.T.astype(np.float32)
     toward = -normals[..., 2]
     key = np.clip(normals @ _light(-0.55, -0.65, -0.62), 0, None)
     fill = np.clip(normals @ _light(0.85, -0.1, -0.5), 0, None)
@@ -207,8 +217,11 @@ def _background(size: tuple[int, int]) -> NDArray[np.float32]:
 
 
 @kernel
-def _rasterise(grid: Map, screen: Map, longest: float, depth: Map, place: Map) -> None:
-    """Draw all quads: depth (h, w) gets the nearest z, place (2, h, w) the column and row of the grid seen there."""
+def _rasterise(grid: Map, screen: Map, longest: float, depth: Map, place: Map, alone: NDArray[np.bool_]) -> None:
+    """Draw all quads: depth (h, w) gets the nearest z, place (2, h, w) the column and row of the grid seen there.
+
+    alone: (H, W) bool, becomes false where a point belongs to a quad.
+    """
     for i in range(grid.shape[0] - 1):
         for j in range(grid.shape[1] - 1):
             near = far = grid[i, j, 2]
@@ -217,8 +230,24 @@ def _rasterise(grid: Map, screen: Map, longest: float, depth: Map, place: Map) -
             z = grid[i, j, 2] + grid[i, j + 1, 2] + grid[i + 1, j, 2] + grid[i + 1, j + 1, 2]
             if not far - near <= longest * z * 0.25:  # NaN fails, too
                 continue
+            alone[i, j] = alone[i, j + 1] = alone[i + 1, j] = alone[i + 1, j + 1] = False
             _triangle(screen, i, j, i, j + 1, i + 1, j, depth, place)
             _triangle(screen, i + 1, j + 1, i + 1, j, i, j + 1, depth, place)
+
+
+@kernel
+def _dots(screen: Map, alone: NDArray[np.bool_], side: int, depth: Map, place: Map) -> None:
+    for i in range(alone.shape[0]):
+        for j in range(alone.shape[1]):
+            x, y, z = screen[i, j, 0], screen[i, j, 1], screen[i, j, 2]
+            # A point behind the eye has no place (NaN fails).
+            if not alone[i, j] or not (abs(x) < 1e6 and abs(y) < 1e6):
+                continue
+            left, top = math.floor(x) - side // 2, math.floor(y) - side // 2
+            for v in range(max(0, top), min(depth.shape[0], top + side)):
+                for u in range(max(0, left), min(depth.shape[1], left + side)):
+                    if z < depth[v, u]:
+                        depth[v, u], place[0, v, u], place[1, v, u] = z, j, i
 
 
 @kernel

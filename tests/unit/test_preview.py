@@ -120,6 +120,24 @@ def test_a_reduced_map_is_the_mean_of_what_is_there():
     assert fit(values[:10, :10], 200, 300).shape == (200, 200)
 
 
+def test_a_map_of_lines_is_missing_only_between_them():
+    values = np.full((90, 120), np.nan, np.float32)
+    values[::9, :60] = 5  # the peaks of stripes, on half of the picture
+    small = fit(values, 40, 30)
+    lines = small[::3]
+    np.testing.assert_allclose(lines[:, :20], 5, rtol=1e-6)
+    assert np.isnan(lines[:, 20:]).all()
+
+
+def test_points_without_neighbours_are_drawn(ball):
+    lines, albedo = ball.truth.xyz.copy(), np.full((240, 320), 100.0, np.float32)
+    lines[np.arange(len(lines)) % 9 != 0] = np.nan
+    drawn = render(lines, albedo, (300, 200))
+    empty = render(np.full_like(lines, np.nan), albedo, (300, 200))
+    bright = drawn.max(axis=-1) > empty.max() + 20
+    assert bright.sum() > 300
+
+
 def test_lettering():
     picture = np.zeros((40, 300, 3), np.uint8)
     width = text(picture, "1 234.5 mm ±σ", (290, 30), align="right")
