@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.geometry import Array
-from scanner.kernel import kernel
+from scanner.kernel import contracting_kernel, kernel
 
 Map = NDArray[np.float32]
 Numbers = tuple[float, ...]
@@ -120,27 +120,51 @@ def _line_of_planes(xs: Array, ys: Array, rows: Map, spread: Map, numbers: Numbe
     return missing
 
 
-@kernel
+@contracting_kernel
 def _line_of_curves(xs: Array, ys: Array, rows: Map, spread: Map, numbers: Numbers, points: Map, sigma_z: Map) -> int:
-    """`_line_of_planes` for any lens, by two steps of Newton's method; where these are not enough there is no point."""
+    """`_line_of_planes` for any lens, by two steps of Newton's method; where these are not enough there is no point.
+
+    Without its lens the projector sees a camera's ray as a straight line, x = x0 + k (y - y0): the unknown is y, from
+    which the depth follows.
+    """
+    t0, t1, t2, fy, cy = numbers[9], numbers[10], numbers[11], numbers[15], numbers[16]
     missing = 0
     for j in range(xs.size):
-        direction = _direction(xs[j], ys[j], numbers)
-        row = np.float64(rows[j])
-        z = _start_of_row(row, direction, numbers)
-        seen, _, slope, _ = _seen(z, direction, numbers)
-        z += (row - seen) / slope
-        seen, _, slope, _ = _seen(z, direction, numbers)
-        z += (row - seen) / slope
-        sigma = np.float64(spread[j]) / abs(slope)
-        possible = (z > 0.0) & (z * direction[2] + numbers[11] > 0.0) & (sigma <= MAX_RELATIVE_SIGMA * z)
+        a0, a1, a2 = _direction(xs[j], ys[j], numbers)
+        y0 = (np.float64(rows[j]) - cy) / fy
+        across, along = a1 - y0 * a2, y0 * t2 - t1
+        before = along * a2 + across * t2
+        inverse = 1.0 / (before * across)
+        x0 = (along * a0 + across * t0) * (inverse * across)
+        k = (a0 - x0 * a2) * (inverse * before)
+        seen, slope = _bent(x0, y0, k, numbers)
+        y = y0 + (y0 - seen) / slope
+        seen, slope = _bent(x0 + k * (y - y0), y, k, numbers)
+        y += (y0 - seen) / slope
+        across = a1 - y * a2
+        z = (y * t2 - t1) / across
+        before = z * a2 + t2
+        sigma = np.float64(spread[j]) * before / (fy * abs(slope * across))
+        possible = (z > 0.0) & (before > 0.0) & (sigma <= MAX_RELATIVE_SIGMA * z)
         # Quadratic convergence: after a step of 0.01 px less than 1e-6 px is left.
-        possible &= abs(row - seen) < 0.01
+        possible &= abs(y0 - seen) * fy < 0.01
         missing += (not possible) & (not math.isnan(rows[j]))
         depth = z if possible else np.nan
         points[3 * j], points[3 * j + 1], points[3 * j + 2] = depth * xs[j], depth * ys[j], depth
         sigma_z[j] = sigma if possible else np.nan
     return missing
+
+
+@contracting_kernel
+def _bent(x: float, y: float, k: float, numbers: Numbers) -> tuple[float, float]:
+    """Where the lens puts the direction (x, y), in y, and how that moves with y where x moves k times as far."""
+    k1, k2, p1, p2, k3 = numbers[17:]
+    r2 = x * x + y * y
+    half = x * k + y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    dradial = half * (2.0 * k1 + r2 * (4.0 * k2 + 6.0 * r2 * k3))
+    bent = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return bent, radial + y * dradial + p1 * (2.0 * half + 4.0 * y) + 2.0 * p2 * (x + y * k)
 
 
 @kernel
