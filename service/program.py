@@ -29,6 +29,7 @@ from service.commands import (
     patterns,
     scan,
     simulate,
+    status,
 )
 from service.terminal import error_document, print_error, print_json
 
@@ -55,7 +56,7 @@ app.command()(doctor.doctor)
 app.command("check-config")(check_config.check_config)
 app.command()(daemon.daemon)
 app.command()(daemon.worker)
-app.command()(daemon.status)
+app.command()(status.status)
 app.add_typer(simulate.group, name="simulate")
 
 

@@ -1,16 +1,12 @@
-"""`fringed daemon`, `fringed worker`, `fringed status`: the processes of a rig, and a look at them."""
+"""`fringed daemon`, `fringed worker`: the processes of a rig."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-
-from scanner.wire import DEFAULT_ENDPOINT
-from service.commands.options import AsJson
-from service.terminal import print_facts, print_json, print_table
 
 
 def daemon(
@@ -55,43 +51,6 @@ def worker(
     start_logging("worker")
     run_worker(connect)
     return 0
-
-
-def status(
-    connect: Annotated[
-        str, typer.Option("--connect", metavar="ENDPOINT", help="The daemon's endpoint.")
-    ] = DEFAULT_ENDPOINT,
-    as_json: AsJson = False,
-) -> int:
-    """Ask a running daemon how it is.
-
-    \b
-    Examples:
-      fringed status
-      fringed status --connect ipc:///tmp/try.ipc --json
-    """
-    from scanner.client import Client  # noqa: PLC0415
-
-    with Client(connect, name="fringed status") as client:
-        content = client.status()
-        scans = client.list_scans()
-    if as_json:
-        print_json({**content, "scans": scans})
-        return 0
-    print_facts("daemon", [(name, _flat(value)) for name, value in content.items()])
-    if scans:
-        columns = ("id", "state", "method", "created", "reason")
-        rows = ([entry.get(column) if entry.get(column) is not None else "" for column in columns] for entry in scans)
-        print_table("scans", columns, rows)
-    return 0
-
-
-def _flat(value: Any) -> str:
-    if isinstance(value, dict):
-        return ", ".join(f"{name} {_flat(inner)}" for name, inner in value.items())
-    if isinstance(value, list):
-        return "; ".join(map(_flat, value)) or "none"
-    return str(value)
 
 
 def state_folder() -> Path:

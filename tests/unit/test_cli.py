@@ -19,7 +19,9 @@ from drivers import registry
 from scanner.devices import DeviceInfo
 from scanner.patterns import PatternSequence, ProjectorSize
 from scanner.scan import load_scan
+from scanner.wire_vectors import CALLS
 from service import cli, program
+from service.commands.status import facts, row
 
 FRINGED = (sys.executable, "-c", "import sys; from service.cli import main; sys.exit(main())")
 COMMANDS = ("scan", "decode", "audit", "patterns", "devices", "check-config", "daemon", "worker", "status")
@@ -432,3 +434,21 @@ def test_bad_calibrations_are_refused(changes: dict[str, Any], run: Run, capture
     assert status == 1
     assert err.startswith("opening") or "error:" in err
     assert not (tmp_path / "out").exists()
+
+
+def test_status_tells_what_a_daemon_answers() -> None:
+    (_, _, content) = next(call for call in CALLS if call[0] == "status")
+    told = dict(facts(content))
+    assert told["camera"] == "simulated camera quick/board, 320 x 240 px, 8 bits"
+    assert told["projector"] == "simulated projector quick/board, 320 x 240 px, framebuffer"
+    assert told["workers"] == "rig-812 on rig (process 812), idle"
+    assert told["jobs"] == "none under way"
+    assert told["spool"] == "13.5 MB, no limit; 1.00 GB of the disk are kept free"
+    (_, _, job) = next(call for call in CALLS if call[0] == "scan.status")
+    busy = {**content, "devices": None, "workers": [], "jobs": [job], "waiting_for_worker": 2}
+    told = dict(facts(busy))
+    assert told["devices"].startswith("not open")
+    assert told["workers"].startswith("none")
+    assert told["waiting"].startswith("2 captured")
+    assert job["id"] in told["jobs"]
+    assert row(job)[:3] == (job["id"], job["method"], job["state"])
