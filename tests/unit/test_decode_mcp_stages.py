@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from scanner.decode.mcp import carriers, dense, emissions, hmm, linking, magnification, stripes, subpixel
+from scanner.decode.mcp import carriers, dense, dense_lines, emissions, hmm, linking, magnification, stripes, subpixel
 from scanner.decode.mcp.model import PatternModel
 from scanner.patterns import McpPattern, ProjectorSize
 
@@ -239,3 +239,67 @@ def test_sigma_grows_between_stripes_where_the_surface_bends_or_steps():
     assert stepped[137] > 20 * sigma
     assert stepped[110] > 4 * sigma
     assert stepped[65] < 2 * sigma  # two stripes away
+
+
+def drawn_plainly(columns, pieces, agree, shape):
+    """`dense_lines.draw` by its formulas, column by column, pixel by pixel."""
+    height, width = shape
+    narrow = np.full((5, height, columns), np.nan)
+    narrow[2] = 0
+    for b, begin, end, f in zip(*pieces, strict=True):
+        y = np.arange(begin, end)
+        t = (y - f[0]) * f[1]
+        u = 1 - t
+        narrow[0, y, b] = f[2] + f[3] * t + t * u * (u * f[4] - t * f[5])
+        narrow[1, y, b] = u * f[6] + t * f[7] + t * u * f[8]
+        narrow[2, y, b] = f[9]
+        narrow[3, y, b], narrow[4, y, b] = u * f[10] + t * f[11], u * f[12] + t * f[13]
+    place = (np.arange(width) - 1.5) / 4
+    left = np.clip(np.floor(place).astype(int), 0, columns - 2)
+    near = np.clip(np.rint(place).astype(int), 0, columns - 1)
+    inside = (place >= 0) & (place <= columns - 1)
+    one_surface = np.abs(narrow[0][:, left + 1] - narrow[0][:, left]) < agree
+    share = place - left
+    between = narrow[:, :, left] * (1 - share) + narrow[:, :, left + 1] * share
+    return np.where(inside & one_surface, between, narrow[:, :, near])
+
+
+def test_maps_are_drawn_as_written_out_pixel_by_pixel():
+    random = np.random.default_rng(7)
+    columns, shape = 9, (70, 38)
+    pieces = [(), (), (), ()]
+    for b in range(columns):
+        y = 0 if b % 2 else 11
+        while y < 60:
+            end = min(y + int(random.integers(0, 25)), shape[0])
+            figures = np.concatenate(([y - 0.5, 0.05], random.uniform(0, 5, dense_lines.FIGURES - 2)))
+            pieces = [(*had, new) for had, new in zip(pieces, (b, y, end, figures), strict=True)]
+            y = end if random.random() < 0.6 else end + 9
+    lists = tuple(np.asarray(part, np.float32 if k == 3 else np.int32) for k, part in enumerate(pieces))
+    expected = drawn_plainly(columns, lists, 1.7, shape)
+    maps = np.empty((5, *shape), np.float32)
+    dense_lines.draw(columns, lists, 1.7, maps)
+    np.testing.assert_allclose(maps, expected, rtol=1e-4, atol=1e-4)
+    alone = np.empty((1, *shape), np.float32)
+    dense_lines.draw(columns, lists, 1.7, alone)
+    np.testing.assert_array_equal(alone[0], maps[0])
+    assert 0.2 < np.isnan(expected[0]).mean() < 0.8
+
+
+def test_rows_alone_are_those_of_all_maps_and_a_lower_run_has_the_say_where_two_overlap():
+    # Stripe 5 is followed by 9 a third of a pitch below: what the first run's end reaches belongs to the second.
+    y = np.array([20, 60, 73, 113], np.float32)
+    row = np.array([100, 127, 235, 262], np.float32)
+    even = np.full(8, np.float32(0.1))
+    knots = dense.Knots(
+        np.array([0, 4, 8], np.int32),
+        np.tile(y, 2),
+        np.tile(row, 2),
+        *(even.copy() for _ in range(4)),
+        np.tile(np.array([4, 5, 9, 10], np.int32), 2),
+    )
+    maps = dense.interpolate(knots, (140, 8), 40.0, 27.0)
+    np.testing.assert_array_equal(dense.rows_alone(knots, (140, 8), 40.0, 27.0), maps.rows)
+    line = maps.rows[:, 3]
+    np.testing.assert_allclose(line[20:57], np.interp(np.arange(20, 57), y[:2], row[:2]), atol=1e-3)
+    np.testing.assert_allclose(line[57:74], 235 - 27 / 40 * np.arange(16, -1, -1), atol=1e-3)
