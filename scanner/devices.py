@@ -480,6 +480,21 @@ class ChecksSetup(Protocol):
         """Look at the host. rate_hz: frames a second wanted; None: as many as the camera gives."""
 
 
+# --- devices that can be looked at while nobody uses them ---------------------------------------------------------
+
+
+@runtime_checkable
+class KnowsPresence(Protocol):
+    """A device whose driver can tell, without using it, whether it is still there."""
+
+    def check_present(self) -> None:
+        """Take a quick look, a millisecond at most; while it is open and idle.
+
+        Raises:
+            DeviceLost: it went away.
+        """
+
+
 # --- devices that know the truth ---------------------------------------------------------------------------------
 
 

@@ -49,6 +49,8 @@ class Scan:
         self._lines = 0
         self._retakes = 0
         self._exposure: dict[str, object] = {"mode": "given"}
+        self.lost: DeviceLost | None = None
+        """the device that went away while it ran"""
 
     def cancel(self) -> None:
         """Stop between two frames."""
@@ -112,8 +114,10 @@ class Scan:
                 self._say(Began(self.job))
                 outcome = self._acquire(writer, disk, images)
             except ScannerError as error:
+                self.lost = error if isinstance(error, DeviceLost) else None
                 disk.close("failed", reason_of(error), (), self._ended_by(error))
                 return
+            self.lost = outcome.error if isinstance(outcome.error, DeviceLost) else None
             state: State = "complete" if outcome.reason is FinishReason.COMPLETED else "failed"
             disk.close(state, outcome.reason.value, outcome.witnesses.as_list(), self._ended_with(outcome))
         self._say(Taken(self.job))

@@ -281,6 +281,7 @@ class DevicesLink:
                 self._fail_opening(error_from_body(error))
                 self._publish("device.failed", None, {"error": error.message})
             case DeviceFault(error=error):
+                self.description = None
                 self._publish("device.lost", None, {"error": error.message})
             case Devices(number=number, devices=devices):
                 if (waiting := self._discoveries.get(number)) is not None and not waiting.done():

@@ -1,7 +1,7 @@
 """The process that owns the devices: `python -m service.devices_process`, started by the daemon.
 
-It opens them through the registry, keeps them open, runs scans into the spool, and shows previews while none runs. A
-library or kernel call that hangs here hangs here alone. It ends when its standard input closes, whatever happened to
+It keeps them open (`service.held_devices`), runs scans into the spool, and shows previews while none runs. A library or
+kernel call that hangs here hangs here alone. It ends when its standard input closes, whatever happened to
 the daemon.
 
     main thread: devices, and nothing else touches them     reader: commands, cancels, the lifeline
@@ -20,9 +20,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 from scanner.clock import Clock, MonotonicClock
-from scanner.errors import DeviceError, ScannerError
+from scanner.errors import DeviceError, DeviceLost, ScannerError
 from scanner.wire import error_body
 from service.acquisition import Scan
+from service.held_devices import HeldDevices
 from service.live_acquisition import LiveRun
 from service.logs import start_logging
 from service.pipe import (
@@ -30,20 +31,18 @@ from service.pipe import (
     AcquireLive,
     CancelAcquire,
     Command,
-    DeviceFault,
     Devices,
     Discover,
     Ended,
     Go,
     Open,
-    Opened,
     OpenFailed,
     Outbox,
     Preview,
     read_command,
 )
 from service.preview import Previewer
-from service.scan_setup import OpenRig, open_rig
+from service.scan_setup import OpenRig
 from service.write_back import WriteBacks
 
 GRACE_S = 3.0
@@ -63,7 +62,7 @@ class DevicesProcess:
         self._scan: Scan | None = None
         self._cancelled: set[str] = set()
         self._lock = threading.Lock()
-        self._opened: OpenRig | None = None
+        self._devices = HeldDevices(clock, outbox.post)
         self._previewer: Previewer | None = None
         self._write_backs = WriteBacks()
 
@@ -75,8 +74,7 @@ class DevicesProcess:
         finally:
             if self._previewer is not None:
                 self._previewer.close()
-            if self._opened is not None:
-                self._opened.close()
+            self._devices.close()
             self._write_backs.wait()
 
     def _serve(self) -> int:
@@ -84,8 +82,7 @@ class DevicesProcess:
             try:
                 command = self._queue.get(timeout=self._patience())
             except queue.Empty:
-                if not self._preview():
-                    return 1
+                self._idle()
                 continue
             if command is None:
                 return 0
@@ -93,17 +90,27 @@ class DevicesProcess:
                 return 1
 
     def _patience(self) -> float | None:
-        return None if self._previewer is None else self._previewer.pause_s()
+        pauses = (self._devices.pause_s(), None if self._previewer is None else self._previewer.pause_s())
+        return min((pause for pause in pauses if pause is not None), default=None)
+
+    def _idle(self) -> None:
+        """What is due while no command waits."""
+        if self._previewer is None:
+            self._devices.mind()
+            return
+        try:
+            self._previewer.show()
+        except DeviceError as error:
+            self._lose(error)
 
     def _obey(self, command: Command) -> bool:
         match command:
             case Open(rig=settings):
                 try:
-                    self._opened = open_rig(settings, self._clock)
+                    self._devices.open(settings)
                 except ScannerError as error:
                     self._outbox.post(OpenFailed(error_body(error)))
                     return False
-                self._outbox.post(described(self._opened))
             case Acquire() | AcquireLive():
                 self._acquire(command)
             case Preview():
@@ -117,11 +124,14 @@ class DevicesProcess:
         return True
 
     def _acquire(self, command: Acquire | AcquireLive) -> None:
-        if self._opened is None:
-            raise AssertionError("the daemon opens devices first")
+        try:
+            opened = self._devices.ready()
+        except ScannerError as error:
+            self._outbox.post(Ended(command.job, None, error=error_body(error)))
+            return
         if self._previewer is not None and self._previewer.rest():
-            self._opened.loaded = None
-        scan = self._made(command, self._opened)
+            opened.loaded = None
+        scan = self._made(command, opened)
         with self._lock:
             self._scan = scan
             if command.job in self._cancelled:
@@ -134,9 +144,18 @@ class DevicesProcess:
                 self._outbox.post(Ended(command.job, "cancelled"))
         except ScannerError as error:
             self._outbox.post(scan.refused(error))
+            scan.lost = scan.lost or (error if isinstance(error, DeviceLost) else None)
         finally:
             with self._lock:
                 self._scan = None
+        if scan.lost is not None:
+            self._lose(scan.lost)
+
+    def _lose(self, error: ScannerError) -> None:
+        if self._previewer is not None:
+            self._previewer.close()
+            self._previewer = None  # the daemon asks for it again when the devices are back
+        self._devices.lose(error)
 
     def _made(self, command: Acquire | AcquireLive, opened: OpenRig) -> Scan:
         if isinstance(command, AcquireLive):
@@ -163,24 +182,14 @@ class DevicesProcess:
                     _log.warning("%s while a scan waits for its go", type(command).__name__)
 
     def _set_preview(self, command: Preview) -> None:
+        opened = self._devices.opened
         if self._previewer is not None:
             self._previewer.close()
             self._previewer = None
-            if self._opened is not None:
-                self._opened.loaded = None
-        if command.rate_hz > 0 and self._opened is not None:
-            self._previewer = Previewer(self._opened.rig, self._clock, command)
-
-    def _preview(self) -> bool:
-        """Show one picture; False where the camera is lost."""
-        if self._previewer is None:
-            return True
-        try:
-            self._previewer.show()
-        except DeviceError as error:
-            self._outbox.post(DeviceFault(error_body(error)))
-            return False
-        return True
+            if opened is not None:
+                opened.loaded = None
+        if command.rate_hz > 0 and opened is not None:
+            self._previewer = Previewer(opened.rig, self._clock, command)
 
     def _read(self) -> None:
         while (command := read_command(self._commands)) is not None:
@@ -197,16 +206,6 @@ class DevicesProcess:
         # The main thread may hang in a library: it has this long to give the devices back.
         threading.Event().wait(GRACE_S)
         os._exit(1)
-
-
-def described(opened: OpenRig) -> Opened:
-    """What the daemon is told of the opened devices."""
-    camera, projector = opened.rig.camera, opened.rig.projector
-    seen, shown = camera.capabilities, projector.capabilities
-    return Opened(
-        camera={"name": camera.name, "width": seen.width, "height": seen.height, "bits": seen.bits},
-        projector={"name": projector.name, "width": shown.width, "height": shown.height, "kind": shown.kind.value},
-    )
 
 
 def _discovered() -> list[dict[str, object]]:

@@ -10,7 +10,7 @@ from typing import Any
 from scanner.capture import CaptureHeader, FrameRecord
 from scanner.clock import Clock
 from scanner.devices import Exposure, TriggerMode
-from scanner.errors import ConfigError, ScannerError
+from scanner.errors import ConfigError, DeviceLost, ScannerError
 from scanner.patterns import McpPattern
 from scanner.sequencer import EndlessFrame, endless
 from scanner.stream import EndReason
@@ -84,6 +84,7 @@ class LiveRun(Scan):
             self._take_all(storage)
         except ScannerError as error:
             failed = error
+            self.lost = error if isinstance(error, DeviceLost) else None
         finally:
             write_backs.close_behind(lambda: self._close(storage, failed))
             self._say(Taken(self.job))

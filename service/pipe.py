@@ -171,7 +171,7 @@ class Devices(Struct, frozen=True, tag="devices"):
 
 
 class DeviceFault(Struct, frozen=True, tag="fault"):
-    """A device failed while no scan ran; the process will exit."""
+    """A device went away: all are given up, and `opened` follows when they are back."""
 
     error: ErrorBody
 

@@ -118,6 +118,7 @@ def open_rig(settings: Mapping[str, Any], clock: Clock) -> OpenRig:
     except BaseException:
         projector.close()
         raise
+    trigger = None
     try:
         trigger = (
             None
@@ -137,6 +138,8 @@ def open_rig(settings: Mapping[str, Any], clock: Clock) -> OpenRig:
         )
     except BaseException:
         camera.close()
+        if trigger is not None:
+            trigger.close()
         projector.close()
         raise
     mode = wanted["trigger_mode"]

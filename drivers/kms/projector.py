@@ -133,6 +133,11 @@ class KmsProjector:
             self._leftover.pop().free()
         return flip
 
+    def check_present(self) -> None:
+        """See `scanner.devices.KnowsPresence`."""
+        self._check_open()
+        self._check_connected()
+
     def close(self) -> None:
         """Leave a black screen and give the card back. May be called twice."""
         if not self._node.open:

@@ -107,6 +107,11 @@ class V4l2Camera:
         whole = (0, 0, self._format.width, self._format.height)
         return CameraSettings(self._exposure_ns, 0.0, self._capture.code, whole)
 
+    def check_present(self) -> None:
+        """See `scanner.devices.KnowsPresence`."""
+        self._check_open()
+        self._require_queue().check_alive()
+
     def start(self, mode: TriggerMode) -> None:
         """Begin to stream; see `scanner.devices.Camera.start`."""
         self._check_open()

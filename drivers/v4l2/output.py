@@ -82,6 +82,10 @@ class V4l2Output:
         check_images(images, shape, self._name)
         self._images = [image.copy() for image in images]
 
+    def check_present(self) -> None:
+        """See `scanner.devices.KnowsPresence`."""
+        self._require_queue().check_alive()
+
     def show(self, index: int) -> Flip:
         """Flip at the next frame; see `scanner.devices.Projector.show`."""
         self._require_queue()
