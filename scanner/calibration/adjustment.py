@@ -41,6 +41,8 @@ HUBER = 2.5
 """Residuals beyond so many sigmas count linearly: 1.2 % of a Gaussian's do."""
 OUTLIER = 6.0
 """Sigmas beyond which a point is left out of the last round: no Gaussian residual of a million lies there."""
+LEAST_KEPT = 0.5
+"""Share of a view's points that outliers must leave: with fewer it is the view that is wrong, not its points."""
 ROUNDS = 4
 """Of sigmas and adjustment in turn; the sigmas then change by less than a per cent."""
 FIRST_TOLERANCE, LAST_TOLERANCE = 1e-5, 1e-9
@@ -184,10 +186,12 @@ class Equations:
         return max(new[0], 1e-4), float(np.clip(new[1], 1e-3, MOST_PROJECTOR_FACTOR))
 
     def within(self, x: Array) -> tuple[NDArray[np.bool_], ...]:
-        """Per view (N,): points whose residuals are no outliers."""
+        """Per view (N,): points whose residuals are no outliers; all where most of a view's are: then the view as a
+        whole contradicts the others, and its residuals must stay to say so."""
         residual, _ = self._points(x)
         good = np.abs(residual * self._weights).max(axis=(0, 2)) < OUTLIER
-        return tuple(np.split(good, np.cumsum(self._counts)[:-1]))
+        each = np.split(good, np.cumsum(self._counts)[:-1])
+        return tuple(one if one.mean() > LEAST_KEPT else np.ones_like(one) for one in each)
 
     def covariance(self, x: Array) -> tuple[Array, float]:
         """Of the parameters that are no pose, (27, 27), zero where fixed; and the weighted square per freedom."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scanner.calibration.adjustment import Adjusted, adjust_again
 from scanner.calibration.lens_slopes import rotation_of
-from scanner.calibration.problem import SHEET, Problem, State, sheet_points
+from scanner.calibration.problem import SHEET, Problem, State, View, sheet_points
 
 Array = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ def hold_out(problem: Problem, adjusted: Adjusted) -> HeldOut:
         part = replace(problem, views=tuple(problem.views[i].only(adjusted.kept[i]) for i in rest))
         begun = replace(adjusted.state, poses=adjusted.state.poses[rest])
         others = adjust_again(part, begun, (adjusted.sigma_camera, adjusted.projector_factor))
-        errors[k] = _predicted(problem, others, k, adjusted.kept[k])
+        errors[k] = prediction(problem, others, problem.views[k].only(adjusted.kept[k]))[1]
         moved.append(others.vector()[: SHEET.start] - adjusted.state.vector()[: SHEET.start])
     if count < FEWEST_FOR_SPREAD:
         return HeldOut(errors)
@@ -62,8 +62,11 @@ def hold_out(problem: Problem, adjusted: Adjusted) -> HeldOut:
     return HeldOut(errors, max(1.0, float(np.median(spread[known] / formal[known]))))
 
 
-def _predicted(problem: Problem, state: State, k: int, kept: NDArray[np.bool_]) -> float:
-    view = problem.views[k].only(kept)
+def prediction(problem: Problem, state: State, view: View) -> tuple[float, float]:
+    """(camera, projector) px rms of a view that the rig has not seen, its pose from its camera points alone.
+
+    NaN, NaN where no pose fits.
+    """
     sheet, _ = sheet_points(problem.target, state.sheet)
     points = sheet[view.ids]
     camera = state.camera
@@ -71,10 +74,14 @@ def _predicted(problem: Problem, state: State, k: int, kept: NDArray[np.bool_]) 
         points, view.camera, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_ITERATIVE
     )
     if not found:
-        return float("nan")
+        return float("nan"), float("nan")
     in_camera = points @ rotation_of(np.ravel(turn)).T + np.ravel(shift)
     seen = state.projector.project(in_camera @ state.rotation.T + state.translation)
+    missed = camera.project(in_camera) - view.camera
     # An error of the camera's point moves the projector's reading with it: that part is no error of the rig.
-    common = (view.slope @ (camera.project(in_camera) - view.camera)[..., None])[..., 0]
-    off = seen - view.projector - common
+    off = seen - view.projector - (view.slope @ missed[..., None])[..., 0]
+    return _rms(missed), _rms(off)
+
+
+def _rms(off: Array) -> float:
     return float(np.sqrt((off**2).sum(axis=1).mean()))

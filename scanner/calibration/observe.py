@@ -6,6 +6,7 @@ poses of which some are unusable still calibrates, and says which were left out 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,7 +53,9 @@ class LeftOut:
 
 
 def find_captures(paths: Sequence[Path]) -> list[Path]:
-    """The captures that paths name: a capture folder, its JSON file, a scan's folder, or a folder of those, sorted.
+    """The captures that paths name: a capture folder, its JSON file, a scan's folder, or a folder of those.
+
+    Each once, in the order in which people count: pose 2 before pose 10.
 
     Raises:
         ConfigError: a path is not there, or holds no capture.
@@ -65,7 +68,12 @@ def find_captures(paths: Sequence[Path]) -> list[Path]:
         if not here:
             raise ConfigError(f"{path} holds no capture", hint=f"a capture is a folder with a {HEADER_FILE} in it")
         found += [capture for capture in here if capture not in found]
-    return found
+    return sorted(found, key=natural)
+
+
+def natural(path: Path) -> list[str | int]:
+    """A key that sorts paths by their numbers' values: text and numbers take turns."""
+    return [int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", str(path)))]
 
 
 def observe(
@@ -154,7 +162,7 @@ def _below(folder: Path, depth: int) -> Iterator[Path]:
     if (folder / HEADER_FILE).is_file():
         yield folder
     elif depth:
-        for child in sorted(folder.iterdir()):
+        for child in folder.iterdir():
             if child.is_dir():
                 yield from _below(child, depth - 1)
 

@@ -215,9 +215,18 @@ def _check_residuals(problem: Problem, adjusted: Adjusted) -> None:
         rms = float(np.sqrt((np.concatenate(residuals) ** 2).sum(axis=1).mean()))
         if not rms <= MOST_RMS_SHARE * size[0]:
             raise CalibrationError(
-                f"no rig fits these points: {rms:.1f} px are left in the {side}",
+                f"no rig fits these points: {rms:.1f} px are left in the {side}{_most_in(problem, residuals)}",
                 hint=MISMATCH,
             )
+
+
+def _most_in(problem: Problem, residuals: Sequence[Array]) -> str:
+    """Words for the views that hold most of the residuals; none where there is only one view."""
+    if len(problem.views) < 2:
+        return ""
+    each = [float(np.sqrt((part**2).sum(axis=1).mean())) for part in residuals]
+    worst = sorted(range(len(each)), key=lambda k: -each[k])[:3]
+    return ", most in " + ", ".join(f"{problem.views[k].name} ({each[k]:.1f} px)" for k in worst)
 
 
 def _check_field(lens: Lens, side: str, depth: Array, tilt: Array) -> None:

@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.calibration.adjustment import Adjusted, adjust
-from scanner.calibration.discs import eccentricity
+from scanner.calibration.adjustment import Adjusted
+from scanner.calibration.agreement import agreed
 from scanner.calibration.held_out import HeldOut, hold_out
 from scanner.calibration.lens_slopes import rotation_of
 from scanner.calibration.observe import LeftOut, Observation
 from scanner.calibration.plausibility import (
-    MISMATCH,
     Facing,
     check_facing,
     check_motion,
@@ -38,21 +37,14 @@ from scanner.calibration.problem import (
     Problem,
     State,
     View,
-    sheet_points,
 )
-from scanner.calibration.start import FEWEST_VIEWS, start
+from scanner.calibration.start import FEWEST_VIEWS
 from scanner.calibration.targets import Target
 from scanner.errors import CalibrationError
 from scanner.geometry import Calibration
 
 Array = NDArray[np.float64]
 
-BAD_VIEW = 4.0
-"""A view whose residual is so many times the median of all views' is bad, and"""
-BAD_VIEW_PX = 0.15
-"""more than this: sharp targets differ from pose to pose by their blur alone, within a tenth of a pixel."""
-DISC_ROUNDS = 3
-"""Of adjustment and the discs' eccentricity in turn."""
 FEW_VIEWS = 6
 MOST_ENTRIES = 12_000_000
 """Of the adjustment's Jacobian, 100 MB: 40 views of 280 points. A step on it takes a few seconds."""
@@ -135,8 +127,6 @@ def solve(
     check_motion(views, camera_size, target)
     tell("adjusting")
     views = thinned(views)
-    begun = start(target, views, camera_size, projector_size)
-    views = _without(views, begun.left_out, out)
     problem = Problem(
         target,
         camera_size,
@@ -145,7 +135,9 @@ def solve(
         _priors(options, target),
         stated_length(options, target),
     )
-    problem, adjusted = _without_bad_views(problem, begun.state, out)
+    found = agreed(problem)
+    problem, adjusted = found.problem, found.adjusted
+    out += found.left_out
     check_state(problem, adjusted)
     warnings = check_stated(problem, adjusted.state, options.baseline_mm, options.distance_mm)
     tell("leaving views out")
@@ -259,66 +251,6 @@ def stated_length(options: SolveOptions, target: Target) -> Length | None:
             hint="measure between the outermost points of the longest row, or correct the target's spacing",
         )
     return Length(*target.longest, mm, max(sigma, 1e-6))
-
-
-def _adjusted(problem: Problem, state: State) -> tuple[Problem, Adjusted]:
-    """The adjustment; discs' centres are corrected for perspective and it is done again."""
-    try:
-        adjusted = adjust(problem, state)
-        seen = problem
-        for _ in range(DISC_ROUNDS if problem.target.discs else 0):
-            problem = replace(seen, views=tuple(_centred(seen, adjusted.state, k) for k in range(len(seen.views))))
-            adjusted = adjust(problem, adjusted.state)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise CalibrationError(
-            f"no rig fits these points: the adjustment ends in nothing ({error})", hint=MISMATCH
-        ) from error
-    return problem, adjusted
-
-
-def _centred(problem: Problem, state: State, k: int) -> View:
-    """A view of discs with each point moved from its ellipse's centre to where the disc's centre is seen."""
-    view, target = problem.views[k], problem.target
-    sheet, _ = sheet_points(target, state.sheet)
-    rotation = rotation_of(state.poses[k, :3])
-    centres = sheet[view.ids] @ rotation.T + state.poses[k, 3:]
-    normals = np.tile((0.0, 0.0, 1.0), (len(centres), 1)) if target.flat else target.normals
-    if normals is None:
-        return view
-    turned = (normals if target.flat else normals[view.ids]) @ rotation.T
-    moved = eccentricity(centres, turned, target.diameter_mm / 2, state.camera.project)
-    return replace(view, camera=view.camera - moved, projector=view.projector - (view.slope @ moved[..., None])[..., 0])
-
-
-def _without_bad_views(problem: Problem, state: State, out: list[LeftOut]) -> tuple[Problem, Adjusted]:
-    """Adjust; leave out the worst view while one contradicts the others, and adjust again."""
-    seen = problem
-    while True:
-        problem, adjusted = _adjusted(seen, state)
-        worst = _worst_view(adjusted) if problem.target.flat else None
-        if worst is None or len(seen.views) <= FEWEST_VIEWS:
-            return problem, adjusted
-        k, why = worst
-        out.append(LeftOut(seen.views[k].name, why))
-        keep = [i for i in range(len(seen.views)) if i != k]
-        seen = replace(seen, views=tuple(seen.views[i] for i in keep))
-        state = replace(adjusted.state, poses=adjusted.state.poses[keep])
-
-
-def _worst_view(adjusted: Adjusted) -> tuple[int, str] | None:
-    found = None
-    for side, residuals in (("camera", adjusted.camera_residuals), ("projector", adjusted.projector_residuals)):
-        rms = np.array([np.sqrt((r**2).sum(axis=1).mean()) for r in residuals])
-        k = int(np.argmax(rms))
-        others = float(np.median(np.delete(rms, k))) if len(rms) > 1 else rms[k]
-        over = rms[k] / max(BAD_VIEW * others, BAD_VIEW_PX)
-        if over > 1 and (found is None or over > found[2]):
-            found = (
-                k,
-                f"contradicts the other views: {rms[k]:.2f} px in the {side} against their {others:.2f} px",
-                over,
-            )
-    return found and found[:2]
 
 
 def _warnings(solution: Solution) -> list[str]:

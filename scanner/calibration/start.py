@@ -42,9 +42,14 @@ class Start:
 
 
 def start(
-    target: Target, views: Sequence[View], camera_size: tuple[int, int], projector_size: tuple[int, int]
+    target: Target,
+    views: Sequence[View],
+    camera_size: tuple[int, int],
+    projector_size: tuple[int, int],
+    *,
+    leave_out: bool = True,
 ) -> Start:
-    """A start for `adjust`.
+    """A start for `adjust`. leave_out: without views that contradict the others.
 
     Raises:
         CalibrationError: too few views that agree, or no start in them.
@@ -60,7 +65,7 @@ def start(
         space = [target.points[v.ids] @ rotation_of(p[:3]).T + p[3:] for v, p in zip(chosen, poses, strict=True)]
         projector, rotation, translation, projector_errors = _projector(space, chosen, projector_size)
         bad = _worst(np.maximum(errors, 0), "camera") or _worst(projector_errors, "projector")
-        if bad is None or len(used) <= (FEWEST_VIEWS if target.flat else 1):
+        if not leave_out or bad is None or len(used) <= (FEWEST_VIEWS if target.flat else 1):
             break
         position, why = bad
         left_out[used.pop(position)] = why

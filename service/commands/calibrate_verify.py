@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -53,6 +54,8 @@ def verify(
         raise typer.BadParameter("--length is the length of a target's longest row: give --target too")
     if repeat and len(scans) < 2:
         raise typer.BadParameter("--repeat compares scans with each other: give two or more, 20 are good")
+    if repeat:
+        _refuse_twice(scans)
     with progress_lines() as lines:
         lines.stage("reading scans", len(scans))
         from scanner.calibration.targets import parse_target  # noqa: PLC0415
@@ -139,6 +142,22 @@ def mcp(
             label="warning",
         )
     return 0
+
+
+def _refuse_twice(scans: list[Path]) -> None:
+    """A scan that is compared with itself repeats perfectly, and so does a copy of it."""
+    seen: dict[object, Path] = {}
+    for folder in scans:
+        file = folder / "scan.npz"
+        keys: list[object] = [folder.resolve()]
+        if file.is_file():
+            with file.open("rb") as content:
+                keys.append(hashlib.file_digest(content, "sha256").digest())
+        for key in keys:
+            if key in seen:
+                how = "is given twice" if folder.resolve() == seen[key].resolve() else f"is a copy of {seen[key]}"
+                raise typer.BadParameter(f"--repeat: {folder} {how}; it takes scans of their own, one after the other")
+            seen[key] = folder
 
 
 def _measured(

@@ -86,6 +86,15 @@ def test_what_cannot_serve_says_why(poses: Path) -> None:
     assert "out of step" in reasons["late"].reason
 
 
+def test_poses_are_counted_as_people_count(tmp_path: Path) -> None:
+    for name in ("10", "2", "1", "b1"):
+        (tmp_path / "poses" / name).mkdir(parents=True)
+        (tmp_path / "poses" / name / "capture.json").write_text("{}")
+    assert [path.name for path in find_captures([tmp_path])] == ["1", "2", "10", "b1"]
+    one = tmp_path / "poses" / "10"
+    assert [path.name for path in find_captures([one, tmp_path, one])] == ["1", "2", "10", "b1"]
+
+
 def test_damaged_captures_are_left_out(poses: Path, tmp_path: Path) -> None:
     (tmp_path / "capture.json").write_text("{")
     found = observe_capture(tmp_path, "broken", TARGET)

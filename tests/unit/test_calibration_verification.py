@@ -229,6 +229,11 @@ def test_verify_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert "flatness mm" in shown.out
     for words in ([], ["--length", "3"], ["--repeat"]):
         assert main(["calibrate", "verify", boards[0], *words]) == 2
+    copy = str(save(tmp_path / "copy", board(0.02, seed=0)))
+    for again, words in ((boards[0] + "/../b0", "is given twice"), (copy, "is a copy of")):
+        capsys.readouterr()
+        assert main(["calibrate", "verify", boards[0], boards[1], again, "--repeat"]) == 2
+        assert words in " ".join(capsys.readouterr().err.split())
     ball_folder = str(save(tmp_path / "ball", ball(noise_mm=0.01)))
     assert main(["calibrate", "verify", ball_folder, "--sphere", "50", "--tolerance", "0.2"]) == 0
     albedo, xyz = scanned_target()

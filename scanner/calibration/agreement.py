@@ -1,0 +1,242 @@
+"""Which views agree: the adjustment of those that do, and the others named, with why.
+
+One wrong view among many stands out by its residuals. Among few it bends the whole fit until none does, or until
+there is no rig at all: then rigs of three views are tried, and the one that most views agree with says which do not.
+These are always a minority: three views of six that agree with each other are no better than the three others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from scanner.calibration.adjustment import ROUNDS, Adjusted, Array, adjust
+from scanner.calibration.discs import eccentricity
+from scanner.calibration.held_out import prediction
+from scanner.calibration.lens_slopes import rotation_of
+from scanner.calibration.observe import LeftOut
+from scanner.calibration.plausibility import MISMATCH
+from scanner.calibration.problem import Problem, State, View, sheet_points
+from scanner.calibration.start import BAD_START_PX, FEWEST_VIEWS, start
+from scanner.errors import CalibrationError
+
+BAD_VIEW = 4.0
+"""A view whose residual is so many times the median of all views' is bad, and"""
+BAD_VIEW_PX = 0.15
+"""more than this: sharp targets differ from pose to pose by their blur alone, within a tenth of a pixel."""
+DISC_ROUNDS = 3
+"""Of adjustment and the discs' eccentricity in turn."""
+DRAWS = 24
+"""Triples of views that are tried: with three bad ones in eight, a triple of good ones is missed once in a hundred."""
+GROWN = 3
+"""Triples, the best, from which groups are grown: of few views one with a bad one may fit by chance."""
+
+
+@dataclass(frozen=True, eq=False)
+class Agreed:
+    """problem: with the views that agree; adjusted: theirs; left_out: the others."""
+
+    problem: Problem
+    adjusted: Adjusted
+    left_out: tuple[LeftOut, ...] = ()
+
+    @property
+    def left_px(self) -> float:
+        """Root mean square of what is left in both pictures, px, over the points that took part."""
+        return float(np.sqrt(np.mean([np.square(part).mean() for part in _kept_residuals(self.adjusted)])))
+
+    @property
+    def worst_px(self) -> float:
+        """That of the view with the largest."""
+        sides = self.adjusted.camera_residuals, self.adjusted.projector_residuals
+        return max(
+            float(np.sqrt((part[kept] ** 2).sum(axis=1).mean()))
+            for side in sides
+            for part, kept in zip(side, self.adjusted.kept, strict=True)
+        )
+
+
+def agreed(problem: Problem) -> Agreed:
+    """Adjust the views that agree.
+
+    Args:
+        problem: of all views.
+
+    Raises:
+        CalibrationError: no majority of three or more does.
+    """
+    found: Agreed | None = None
+    failure: CalibrationError | None = None
+    try:
+        found = _without_bad_views(problem)
+    except CalibrationError as error:
+        failure = error
+    if problem.target.flat and (found is None or found.worst_px > BAD_VIEW_PX):
+        found = _searched(problem, found) or found
+    if found is not None:
+        return found
+    assert failure is not None  # noqa: S101  nothing was found, so something was raised
+    raise CalibrationError(f"{failure}; no majority of the {len(problem.views)} views agrees", hint=failure.hint)
+
+
+def _without_bad_views(problem: Problem) -> Agreed:
+    """Start and adjust; leave out the worst view while one stands out, and adjust again."""
+    begun = start(problem.target, problem.views, problem.camera_size, problem.projector_size)
+    out = [LeftOut(problem.views[k].name, why) for k, why in sorted(begun.left_out.items())]
+    seen = _of(problem, begun.used)
+    state = begun.state
+    while True:
+        corrected, adjusted = _adjusted(seen, state)
+        worst = _worst_view(adjusted) if problem.target.flat else None
+        if worst is None or len(seen.views) <= FEWEST_VIEWS:
+            return Agreed(corrected, adjusted, tuple(out))
+        k, why = worst
+        out.append(LeftOut(seen.views[k].name, why))
+        keep = [i for i in range(len(seen.views)) if i != k]
+        seen = _of(seen, keep)
+        state = replace(adjusted.state, poses=adjusted.state.poses[keep])
+
+
+def _searched(problem: Problem, whole: Agreed | None) -> Agreed | None:
+    """The largest group that agrees, grown from triples; None where the rest does not contradict it clearly."""
+    count = len(problem.views)
+    if count <= FEWEST_VIEWS:
+        return None
+    every = whole if whole is not None and not whole.left_out else _fitted(problem)
+    before = every.left_px if every is not None else np.inf
+    ranked = sorted(((_score(problem, triple), triple) for triple in _triples(count)), key=lambda trial: trial[0])
+    groups = [_grown(problem, triple) for score, triple in ranked[:GROWN] if np.isfinite(score)]
+    found = [
+        (used, fit)
+        for used, fit in groups
+        if fit is not None and count // 2 < len(used) < count and BAD_VIEW * fit.left_px <= before
+    ]
+    if not found:
+        return None
+    # A large group that a bad view bends is no better than the small one that it was grown from.
+    least = min(fit.left_px for _, fit in found)
+    clean = [group for group in found if group[1].worst_px <= max(BAD_VIEW * least, BAD_VIEW_PX)]
+    used, best = max(clean or found, key=lambda group: (len(group[0]), -group[1].left_px))
+    return replace(best, left_out=tuple(_contradicting(problem, best, k) for k in range(count) if k not in used))
+
+
+def _triples(count: int) -> list[tuple[int, ...]]:
+    """All triples of views where they are few, else as many random ones."""
+    every = list(combinations(range(count), FEWEST_VIEWS))
+    if len(every) <= DRAWS:
+        return every
+    drawn = np.random.default_rng(1984).choice(len(every), DRAWS, replace=False)
+    return [every[k] for k in drawn]
+
+
+def _score(problem: Problem, triple: Sequence[int]) -> float:
+    """px that a majority of the views miss the triple's rig by, at most: least median of squares (Rousseeuw 1984)."""
+    fit = _fitted(_of(problem, triple), rounds=2)
+    if fit is None:
+        return float("inf")
+    return float(np.sort(_misses(problem, fit))[len(problem.views) // 2])
+
+
+def _misses(problem: Problem, fit: Agreed) -> Array:
+    """(V,) px: by how much each view misses a rig; infinite where no pose fits it."""
+    state = fit.adjusted.state
+    missed = [max(prediction(problem, state, view)) for view in problem.views]
+    found: Array = np.nan_to_num(np.array(missed), nan=np.inf)
+    return found
+
+
+def _grown(problem: Problem, triple: Sequence[int]) -> tuple[list[int], Agreed | None]:
+    """The views that agree with a triple's rig, the nearest half of them first, and with the rig found so, and so on;
+    and the last rig."""
+    used = list(triple)
+    best = _fitted(_of(problem, used))
+    while best is not None and len(used) < len(problem.views):
+        misses = _misses(problem, best)
+        floor = BAD_START_PX if len(used) == FEWEST_VIEWS else BAD_VIEW_PX
+        allowed = max(BAD_VIEW * float(np.median(misses[used])), floor)
+        near = [int(k) for k in np.argsort(misses) if k not in used and misses[k] <= allowed]
+        if not near:
+            return used, best
+        used = sorted([*used, *near[: (len(near) + 1) // 2]])
+        best = _fitted(_of(problem, used))
+    return used, best
+
+
+def _contradicting(problem: Problem, best: Agreed, k: int) -> LeftOut:
+    view = problem.views[k]
+    camera, projector = prediction(problem, best.adjusted.state, view)
+    side, missed = ("projector", projector) if projector > camera else ("camera", camera)
+    words = f"{missed:.2f} px in the {side} against their {best.left_px:.2f} px" if np.isfinite(missed) else "no pose"
+    return LeftOut(view.name, f"contradicts the other views: {words}")
+
+
+def _fitted(problem: Problem, rounds: int = ROUNDS) -> Agreed | None:
+    """All views of a problem, with a start of their own; None where there is none."""
+    try:
+        begun = start(problem.target, problem.views, problem.camera_size, problem.projector_size, leave_out=False)
+        return Agreed(*_adjusted(problem, begun.state, rounds))
+    except CalibrationError:
+        return None
+
+
+def _of(problem: Problem, used: Sequence[int]) -> Problem:
+    return replace(problem, views=tuple(problem.views[k] for k in used))
+
+
+def _adjusted(problem: Problem, state: State, rounds: int = ROUNDS) -> tuple[Problem, Adjusted]:
+    """The adjustment; discs' centres are corrected for perspective and it is done again."""
+    try:
+        adjusted = adjust(problem, state, rounds)
+        seen = problem
+        for _ in range(DISC_ROUNDS if problem.target.discs else 0):
+            problem = replace(seen, views=tuple(_centred(seen, adjusted.state, k) for k in range(len(seen.views))))
+            adjusted = adjust(problem, adjusted.state, rounds)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise CalibrationError(
+            f"no rig fits these points: the adjustment ends in nothing ({error})", hint=MISMATCH
+        ) from error
+    return problem, adjusted
+
+
+def _centred(problem: Problem, state: State, k: int) -> View:
+    """A view of discs with each point moved from its ellipse's centre to where the disc's centre is seen."""
+    view, target = problem.views[k], problem.target
+    sheet, _ = sheet_points(target, state.sheet)
+    rotation = rotation_of(state.poses[k, :3])
+    centres = sheet[view.ids] @ rotation.T + state.poses[k, 3:]
+    normals = np.tile((0.0, 0.0, 1.0), (len(centres), 1)) if target.flat else target.normals
+    if normals is None:
+        return view
+    turned = (normals if target.flat else normals[view.ids]) @ rotation.T
+    moved = eccentricity(centres, turned, target.diameter_mm / 2, state.camera.project)
+    return replace(view, camera=view.camera - moved, projector=view.projector - (view.slope @ moved[..., None])[..., 0])
+
+
+def _worst_view(adjusted: Adjusted) -> tuple[int, str] | None:
+    found = None
+    for side, residuals in (("camera", adjusted.camera_residuals), ("projector", adjusted.projector_residuals)):
+        rms = _view_rms(residuals)
+        k = int(np.argmax(rms))
+        others = float(np.median(np.delete(rms, k))) if len(rms) > 1 else rms[k]
+        over = rms[k] / max(BAD_VIEW * others, BAD_VIEW_PX)
+        if over > 1 and (found is None or over > found[2]):
+            found = (
+                k,
+                f"contradicts the other views: {rms[k]:.2f} px in the {side} against their {others:.2f} px",
+                over,
+            )
+    return found and found[:2]
+
+
+def _view_rms(residuals: Sequence[Array]) -> Array:
+    return np.array([np.sqrt((r**2).sum(axis=1).mean()) for r in residuals])
+
+
+def _kept_residuals(adjusted: Adjusted) -> list[Array]:
+    """(N,) px of the points that took part: distances in the camera, and in the projector."""
+    kept = np.concatenate(adjusted.kept)
+    sides = adjusted.camera_residuals, adjusted.projector_residuals
+    return [np.linalg.norm(np.concatenate(side)[kept], axis=1) for side in sides]
