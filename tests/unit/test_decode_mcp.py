@@ -200,6 +200,22 @@ def test_a_code_order_that_was_rotated_is_refused_where_it_begins_again():
             decode_image(frame, replace(OWN, codes=OWN.codes[shift:] + OWN.codes[:shift]), PROJECTOR, CAMERA)
 
 
+@pytest.mark.parametrize("first", [1, 3, 4])
+@pytest.mark.parametrize("pattern", [OWN, PUBLISHED], ids=["own", "published"])
+def test_code_words_in_one_another_s_places_are_refused_by_name(pattern, first):
+    frame, _ = render(pattern)
+    codes = list(pattern.codes)
+    codes[first], codes[first + 1] = codes[first + 1], codes[first]
+    with pytest.raises(DecodeError, match=f"words {codes[first]} and {codes[first + 1]} stand in one another's places"):
+        decode_image(frame, replace(pattern, codes=tuple(codes)), PROJECTOR, CAMERA)
+
+
+def test_a_dark_stripe_where_another_is_described_is_refused_by_name():
+    frame, _ = render(replace(PUBLISHED, codes=(1, 2, 3, 0, 4, 5, 6, 7)))
+    with pytest.raises(DecodeError, match="words 0 and 3 stand"):
+        decode_image(frame, replace(PUBLISHED, codes=(1, 2, 0, 3, 4, 5, 6, 7)), PROJECTOR, CAMERA)
+
+
 @pytest.mark.parametrize("bits", [2, 4])
 def test_other_bits_than_described_are_refused(bits):
     frame, _ = render(OWN)

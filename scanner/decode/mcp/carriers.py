@@ -29,15 +29,19 @@ SCALE_RANGE = 2.2
 seen at 60 degrees, or projector pixels twice as wide as high."""
 
 DRIFT_Y = np.arange(-0.18, 0.181, 0.02)
-DRIFT_X = np.arange(-0.09, 0.091, 0.03)
+DRIFT_X = np.arange(-0.15, 0.151, 0.03)
 """Drifts searched, from the image's middle to its border, natural logarithms: across the stripes (a projector at 15
 degrees to the camera drifts by .1 over 20 degrees of view) and along them."""
 
-TILES_Y, TILES_X = 6, 2
-"""Tiles of the search. Narrow across the stripes, where the drift is."""
+TILES_Y, TILES_X = 6, 4
+"""Tiles of the search: within one the drift must not reach the distance of two carriers, a tenth."""
 
 ENOUGH_PIECES = 16
 """Long pieces of stripe that suffice for the search: half a pattern's worth."""
+
+LEAST_LINE = 0.1
+"""Share of a spectrum's strongest line that is no line: its skirts fall to that within the window's lobe, and where
+nothing lies between the carriers they would seem to stand out of it."""
 
 LOG_STEP = 0.004
 """Steps of the magnification: a quarter of a bin at the highest carrier."""
@@ -144,8 +148,8 @@ def search_carriers(
         around: magnification expected, from the pitch.
         shape: (H, W) of the image.
     """
-    # Long enough to part the two nearest carriers at the largest magnification's period.
-    size = int(np.clip(2 ** np.ceil(np.log2(2.0 * around / model.separation)), 64, 1024))
+    # Three beats of the two nearest carriers: what lies between them is then outside a Hann window's lobes of both.
+    size = STEP * round(float(np.clip(3 * around / model.separation, 64, 1024)) / STEP)
     steps = np.arange(-np.log(SCALE_RANGE), np.log(SCALE_RANGE), LOG_STEP)
     scales = around * np.exp(steps)
     # Beyond .45 cycles a pixel neither columns of four pixels nor a blurred lens show a carrier.
@@ -176,7 +180,8 @@ def _contrasts(spectrum: NDArray[np.float64], scales: NDArray[np.float64], model
     # Each carrier against its own two neighbours: a slope of the background favours none.
     rank = np.argsort(np.argsort(model.carriers))
     ground = np.sqrt(off[:, rank] * off[:, rank + 1])
-    return np.asarray(np.log(np.maximum(on / np.maximum(ground, 1e-9), 0.1)))
+    least = LEAST_LINE * float(spectrum.max()) + 1e-9
+    return np.asarray(np.log((on + least) / (ground + least)))
 
 
 def _align(
@@ -188,18 +193,17 @@ def _align(
 ) -> CarrierSearch:
     """The magnification and drifts at which the tiles' contrasts (T, Q, N) agree best."""
     # One line of texture must not stand for a set of carriers: none counts for more than a factor of three.
-    score = logs.clip(-1, np.log(3)).sum(axis=2) + 0.5 * logs.min(axis=2)
-    score = score * weights[:, None]
-    index = np.arange(len(scales))[None, :]
+    score = np.ascontiguousarray(logs.clip(0, np.log(3)) * weights[:, None, None])
     # Short chains resolve little: between like scores the one nearest to what the pitch says.
     doubt = 4 * weights.sum() * np.log(scales / around) ** 2
     best = (-np.inf, 0, 0.0, 0.0)
-    rows = np.arange(len(at))[:, None]
+    each = np.empty((len(scales), logs.shape[2]))
     for drift_y in DRIFT_Y:
         for drift_x in DRIFT_X:
-            shift = np.rint((at[:, 0] * drift_x + at[:, 1] * drift_y) / LOG_STEP).astype(int)[:, None]
+            _shifted_sum(score, np.rint((at[:, 0] * drift_x + at[:, 1] * drift_y) / LOG_STEP).astype(np.int32), each)
+            # A tile's few stripes may lack a carrier, the image lacks none: another set's lines fit some of ours only.
+            total = each.sum(axis=1) + each.shape[1] * each.min(axis=1)
             # Without need no drift: a hundredth of the score for each tenth.
-            total = score[rows, np.clip(index + shift, 0, len(scales) - 1)].sum(axis=0)
             total = total - doubt - 0.1 * (abs(drift_x) + abs(drift_y)) * np.abs(total)
             q = int(np.argmax(total))
             if total[q] > best[0]:
@@ -208,6 +212,18 @@ def _align(
     own = np.clip(q + np.rint((at[:, 0] * drift_x + at[:, 1] * drift_y) / LOG_STEP).astype(int), 0, len(scales) - 1)
     seen = np.average(logs[np.arange(len(at)), own], axis=0, weights=weights)
     return CarrierSearch(float(scales[q]), drift_x, drift_y, tuple(float(c) for c in np.exp(seen)))
+
+
+@kernel
+def _shifted_sum(score: NDArray[np.float64], shift: Ints, total: NDArray[np.float64]) -> None:
+    """Sum over the tiles of `score` (T, Q, N), each moved by its own `shift` along Q; (Q, N)."""
+    tiles, size, channels = score.shape
+    total[:] = 0
+    for t in range(tiles):
+        for q in range(size):
+            moved = min(max(q + shift[t], 0), size - 1)
+            for i in range(channels):
+                total[q, i] += score[t, moved, i]
 
 
 def _spectra(light: Array, chains: Chains, size: int) -> tuple[NDArray[np.float64], Ints]:

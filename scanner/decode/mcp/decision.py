@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.mcp import emissions, hmm, linking, magnification, stripes, subpixel
+from scanner.decode.mcp import description, emissions, hmm, linking, magnification, stripes, subpixel
 from scanner.decode.mcp.locate import Array, Found, Stages
 from scanner.decode.mcp.model import PatternModel
 
@@ -42,7 +42,7 @@ class Decision:
     confidence: Array
     light: Array
     fine: subpixel.Fine
-    agreement: emissions.Agreement
+    agreement: description.Agreement
     magnification: float
     figures: dict[str, Any]
 
@@ -90,7 +90,7 @@ def decide(found: Found, model: PatternModel, clock: Stages) -> Decision:
         label[chains.order[~long_enough]] = -1
         label[linking.silhouettes(found.reduced, peaks, chains)] = -1
     with clock.stage("agreement"):
-        agrees = emissions.agreement(here, evidence, model, modulation, path, (sites.start, gap))
+        agrees = description.agreement(here, evidence, model, modulation, path, (sites.start, gap))
     with clock.stage("sub-pixel"):
         fine = subpixel.refine(found.reduced, peaks, chains, label, found.pitch)
     figures = {
@@ -103,7 +103,7 @@ def decide(found: Found, model: PatternModel, clock: Stages) -> Decision:
         "modulation": [round(float(m), 3) for m in modulation],
         "noise_floor": [round(float(f), 4) for f in floor],
         "window_px": size,
-        "agreement": {key: round(value, 4) for key, value in asdict(agrees).items()},
+        "agreement": {key: np.round(value, 4).tolist() for key, value in asdict(agrees).items()},
         "peaks": len(peaks),
         "peaks_decided": int((label >= 0).sum()),
         "thresholds": {"decided": DECIDED, "min_chain_px": MIN_CHAIN_PX, "height_share": stripes.HEIGHT_FLOOR},

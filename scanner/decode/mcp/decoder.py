@@ -103,7 +103,13 @@ def _decode_anew(upright: Image, model: PatternModel, camera: CameraFormat) -> t
     if again.agreement.holds:
         return upside_down(maps_of(turned, found, again, model, clock)), _learnt(found, again, upside_down=True)
     _refuse_turned(upright, model, camera)
-    a = decided.agreement
+    a = max(decided.agreement, again.agreement, key=lambda agreement: agreement.agree)
+    if a.exchanged:
+        words = " and ".join(str(word) for word in a.exchanged)
+        raise DecodeError(
+            f"the codes contradict the description: code words {words} stand in one another's places",
+            hint='exchange them in the description\'s "codes" if that is what is projected',
+        )
     raise DecodeError(
         "stripes and carriers are there, but the codes contradict the description "
         f"(of {a.clear:.0%} clear code words {a.agree:.0%} fit, {a.order:.0%} of neighbours are in order)",

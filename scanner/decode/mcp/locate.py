@@ -25,11 +25,15 @@ Image = NDArray[Any]
 MIN_CONTRAST = 1.25
 """Least ratio of a carrier's amplitude to what lies between the carriers, in the mean over the channels."""
 
-PLAIN_CONTRAST = 1.8
-"""Contrast at which no other pitch is tried: noise and texture alone stay below 1.3."""
+PLAIN_CONTRAST = 1.5
+"""Contrast at which no other pitch is tried: noise and texture alone stay below 1.2."""
 
 PITCHES_TRIED = 3
 """Candidates for the pitch: the stripes', and two that texture may offer."""
+
+EVEN = 1.25
+"""Ratio of the peaks' median distance to the pitch, or the inverse, up to which they go together: keystone and texture
+take less, and a pattern taken for half or twice as fine is off by two."""
 
 NEAR = 0.06
 """Change of the stripes' distance, relative, up to which pitch and carriers of a frame before serve."""
@@ -54,7 +58,10 @@ class Stages:
 
 @dataclass
 class Found:
-    """What the search for stripes and carriers found; `fault` says why it is no pattern, if it is none."""
+    """What the search for stripes and carriers found; `fault` says why it is no pattern, if it is none.
+
+    even: the peaks lie about as far apart as the pitch says.
+    """
 
     fault: str | None = None
     hint: str | None = None
@@ -63,6 +70,7 @@ class Found:
     pitch: float = 0.0
     match: float = 0.0
     contrast: float = 0.0
+    even: bool = True
     peaks: stripes.Peaks | None = None
     chains: linking.Chains | None = None
     signals: carriers.Signals | None = None
@@ -82,7 +90,7 @@ class Known:
     """What one frame teaches of the next: pitch and carriers, and how well the frame agreed with them.
 
     upside_down: the image is turned before. spacing: decoded stripes' median distance, px. magnification: median of the
-    field about the search's own. hits: as in `emissions.Agreement`. decided: share of the peaks with a stripe.
+    field about the search's own. hits: as in `description.Agreement`. decided: share of the peaks with a stripe.
     """
 
     pitch: float
@@ -136,9 +144,9 @@ def locate(image: Image, model: PatternModel, camera: CameraFormat, clock: Stage
     best: Found | None = None
     for pitch, match in candidates:
         trial = _search(replace(found, pitch=pitch, match=match), image, model, camera, clock)
-        if trial.contrast >= PLAIN_CONTRAST:
+        if trial.even and trial.contrast >= PLAIN_CONTRAST:
             return trial
-        if best is None or trial.contrast > best.contrast:
+        if best is None or (trial.even, trial.contrast) > (best.even, best.contrast):
             best = trial
     return best or found
 
@@ -156,6 +164,7 @@ def _search(found: Found, image: Image, model: PatternModel, camera: CameraForma
     with clock.stage("peaks"):
         longest = around / float(model.carriers.min())
         found.peaks = stripes.find_peaks(found.reduced, found.pitch, longest, found.noise, model.weakest)
+        found.even = 1 / EVEN < stripes.spacing(found.peaks) / found.pitch < EVEN
     with clock.stage("chains"):
         found.chains = linking.link(found.peaks, found.pitch)
         found.signals = carriers.signals_along(image, found.peaks, found.chains, found.pitch, camera.max_value)

@@ -197,6 +197,13 @@ def find_peaks(reduced: Array, pitch: float, carrier_px: float, noise: float, we
     return _as_peaks(np.concatenate(([0], np.cumsum(counts))).astype(np.int32), rows[keep])
 
 
+def spacing(peaks: Peaks) -> float:
+    """Median distance of neighbouring peaks in a column, px; 0 where there are none."""
+    apart = np.diff(peaks.y)
+    apart = apart[apart > 0]  # not from the foot of one column to the head of the next
+    return float(np.median(apart)) if apart.size else 0.0
+
+
 def _as_peaks(start: NDArray[np.int32], rows: Array) -> Peaks:
     y, height, valley, above, below, clear = (np.ascontiguousarray(rows[:, k]) for k in range(6))
     return Peaks(start, y, height, valley, above, below, clear.astype(np.uint8))

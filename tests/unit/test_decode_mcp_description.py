@@ -1,0 +1,80 @@
+"""Is the pattern the one described: the search for its carriers, and code words that stand in one another's places."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scanner.decode.mcp import carriers, description, hmm, linking, stripes
+from scanner.decode.mcp.model import PatternModel
+from scanner.patterns import McpPattern, ProjectorSize
+
+PROJECTOR = ProjectorSize(1152, 864)
+OWN = PatternModel.of(McpPattern(), PROJECTOR)
+PUBLISHED = PatternModel.of(
+    McpPattern(carriers=(90.0, 106.0, 120.0, 132.0), codes=tuple(range(16)), levels="composite"), PROJECTOR
+)
+
+
+def test_a_place_in_the_order_is_what_most_of_a_run_say():
+    a_break = hmm.MAX_GAP
+    runs = [  # path, gap to the peak before, expected places
+        ([3, 4, -1, 6, 9, 8], [0, 0, 0, 0, 0, 0], [3, 4, 5, 6, 7, 8]),
+        ([5, 6, 8, 9, 2], [0, 0, 1, 0, 0], [5, 6, 8, 9, 10]),
+        ([1, 2, 3, 7, 8, 9, 10], [0, 0, 0, a_break, 0, 0, 0], [-1, -1, -1, 7, 8, 9, 10]),
+        ([4, 9, 6, 11, 8, 13, 10, 15], [0] * 8, [-1] * 8),
+        ([-1, 0, 1, 2, 3], [0] * 5, [-1, 0, 1, 2, 3]),
+    ]
+    path, gap, expected = (np.concatenate([run[k] for run in runs]).astype(np.int32) for k in range(3))
+    first = np.concatenate([np.arange(len(run[0])) == 0 for run in runs])
+    np.testing.assert_array_equal(description.places_in_order(path, first, gap), expected)
+
+
+def test_words_that_trade_places_are_told_from_a_few_wrong_ones():
+    word = np.unique(OWN.ratio > 0, axis=0, return_inverse=True)[1].ravel()
+    place = np.repeat(np.arange(OWN.stripes, dtype=np.int32), 20)
+
+    def said(shown):
+        each = np.zeros((len(place), 16), np.float32)
+        each[np.arange(len(place)), shown] = 2 * description.CLEAR
+        return description.exchanged_words(each, place, word, OWN)
+
+    shown = word[place]
+    assert said(shown) == ()
+    one_wrong = np.where(place == 6, word[8], shown)
+    assert said(one_wrong) == ()
+    traded = np.where(place == 8, word[6], one_wrong)
+    assert said(traded) == (McpPattern().codes[3], McpPattern().codes[4])
+    assert said(np.where(np.arange(len(place)) % 20 < 12, shown, traded)) == ()
+    round_three = np.select([place == 6, place == 8, place == 20], [word[8], word[20], word[6]], shown)
+    assert said(round_three) == tuple(McpPattern().codes[k] for k in (3, 4, 10))
+
+
+def test_carriers_of_one_set_are_not_taken_for_another_where_the_magnification_drifts():
+    random = np.random.default_rng(5)
+    rows, columns = np.arange(20, 1000, 38), np.arange(348)
+    x, y = np.meshgrid((columns + 0.5) / 174 - 1, rows / 520.0 - 1)
+    scale = 1.4 * np.exp(0.1 * x - 0.12 * y)
+    phase = np.cumsum(np.repeat(4 / scale, 4, axis=1) / 4, axis=1)
+    light = np.ones_like(phase) + 0.02 * random.normal(size=phase.shape)
+    for k in range(1, len(rows), 2):
+        word = k // 2 + 1  # natural order: neighbours lack the same carriers
+        on = [carrier for i, carrier in enumerate(PUBLISHED.carriers) if word >> i & 1]
+        light[k] += 0.25 * np.cos(2 * np.pi * np.outer(on, phase[k])).sum(axis=0)
+    count = len(rows) * len(columns)
+    order = np.arange(count, dtype=np.int32).reshape(len(columns), len(rows)).T.ravel()
+    chains = linking.Chains(
+        np.ascontiguousarray(order),
+        np.arange(0, count + 1, len(columns), dtype=np.int32),
+        np.repeat(columns, len(rows)).astype(np.int32),
+    )
+    zero = np.zeros(count, np.float32)
+    start = np.arange(0, count + 1, len(rows), dtype=np.int32)
+    at = np.tile(rows, len(columns)).astype(np.float32)
+    peaks = stripes.Peaks(start, at, zero, zero, zero, zero, np.ones(count, np.uint8))
+    signals = carriers.Signals(light.astype(np.float32).ravel(), zero)
+    found = carriers.search_carriers(signals, peaks, chains, PUBLISHED, 38 / 27, (1040, 1392))
+    assert found.scale == pytest.approx(1.4, rel=0.02)
+    assert found.drift_x == pytest.approx(0.1, abs=0.031)
+    assert found.drift_y == pytest.approx(-0.12, abs=0.031)
+    assert np.prod(found.contrast) ** 0.25 > 1.25
