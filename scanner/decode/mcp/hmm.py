@@ -9,6 +9,7 @@ be no stripe at all: the chain then stays in its state (the dissertation's error
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,8 +58,9 @@ class Columns:
     stray: Array
 
 
+@lru_cache(maxsize=8)
 def transitions(stripes: int) -> Array:
-    """(2 MAX_GAP, S, S) float32: probability from stripe [1] to stripe [2] over a gap of g + 1 pitches.
+    """(2 MAX_GAP, S, S) float32, read-only: probability from stripe [1] to stripe [2] over a gap of g + 1 pitches.
 
     The first MAX_GAP tables are for one surface, the others for where an edge lies between the two peaks.
     """
@@ -69,7 +71,9 @@ def transitions(stripes: int) -> Array:
             regular = miss ** np.abs(step - gap) * (1 - miss)
             table = np.where(step > 0, np.maximum(regular, jump), BACK)
             tables.append(np.where(step == 0, REPEAT, table))
-    return np.ascontiguousarray(tables, np.float32)
+    result = np.ascontiguousarray(tables, np.float32)
+    result.flags.writeable = False
+    return result
 
 
 def gaps(start: Ints, y: Array, height: Array, pitch: float, weakest: float) -> Ints:
@@ -116,43 +120,65 @@ NEGLIGIBLE = np.float32(1e-6)
 """Shares of a distribution below which a state is passed over: far under what JUMP gives every other state."""
 
 
+# Rows of matrices are named by matrix and number: a slice of its own costs more than the loop over 32 states.
+
+
 @summing_kernel
-def _move(source: Array, table: Array, least: np.float32, target: Array) -> None:
-    """target = source @ table, without the sources below `least`, which hardly matter."""
-    states = len(source)
-    target[:] = 0
+def _move(source: Array, t: int, tables: Array, g: int, least: np.float32, target: Array) -> None:
+    """target[t] = source[t] @ tables[g], without the sources of `least` or less, which hardly matter."""
+    states = source.shape[1]
+    for s in range(states):
+        target[t, s] = np.float32(0)
     for p in range(states):
-        a = source[p]
+        a = source[t, p]
         if a > least:
-            row = table[p]
             for s in range(states):
-                target[s] += a * row[s]
+                target[t, s] += a * tables[g, p, s]
 
 
 @summing_kernel
-def _normalise(values: Array) -> None:
+def _mix(moved: Array, likely: Array, t: int, lost: np.float32, alpha: Array) -> None:
+    """alpha[t + 1] = moved[t] * likely[t] + alpha[t] * lost, normalised."""
+    states = moved.shape[1]
     total = np.float32(0)
-    for s in range(len(values)):
-        total += values[s]
+    for s in range(states):
+        value = moved[t, s] * likely[t, s] + alpha[t, s] * lost
+        alpha[t + 1, s] = value
+        total += value
     scale = np.float32(1) / max(total, np.float32(1e-30))
-    for s in range(len(values)):
-        values[s] *= scale
+    for s in range(states):
+        alpha[t + 1, s] *= scale
 
 
 @summing_kernel
-def _likelihoods(evidence: Array, stray_log: np.float32, likely: Array) -> np.float32:
-    """Likelihoods from logarithms, the largest at 1 - STRAY; returns that of a stray peak."""
+def _likelihoods(evidence: Array, k: int, stray_log: np.float32, t: int, likely: Array) -> np.float32:
+    """likely[t] = evidence[k]'s likelihoods, the largest at 1 - STRAY; returns that of a stray peak."""
+    states = evidence.shape[1]
     top = stray_log
-    for s in range(len(evidence)):
-        top = max(top, evidence[s])
-    for s in range(len(evidence)):
+    for s in range(states):
+        top = max(top, evidence[k, s])
+    for s in range(states):
         # exp(x) = (1 + x / 1024)^1024, exact to 1e-3 where it matters, in vector registers.
-        x = max(np.float32(1) + (evidence[s] - top) * np.float32(1 / 1024), np.float32(0))
+        x = max(np.float32(1) + (evidence[k, s] - top) * np.float32(1 / 1024), np.float32(0))
         for _ in range(10):
             x *= x
-        likely[s] = np.float32(1 - STRAY) * x
+        likely[t, s] = np.float32(1 - STRAY) * x
     lost: np.float32 = np.float32(STRAY) * np.exp(stray_log - top)
     return lost
+
+
+@summing_kernel
+def _mix_back(moved: Array, t: int, lost: np.float32, beta: Array) -> None:
+    """beta[t] = moved[t] + beta[t + 1] * lost, normalised."""
+    states = moved.shape[1]
+    total = np.float32(0)
+    for s in range(states):
+        value = moved[t, s] + beta[t + 1, s] * lost
+        beta[t, s] = value
+        total += value
+    scale = np.float32(1) / max(total, np.float32(1e-30))
+    for s in range(states):
+        beta[t, s] *= scale
 
 
 @kernel
@@ -177,43 +203,40 @@ def _forward_backward(
     states = evidence.shape[1]
     longest = _longest(start)
     alpha = np.empty((longest + 1, states), np.float32)
+    beta = np.empty((longest + 1, states), np.float32)
     moved = np.empty((longest, states), np.float32)
     likely = np.empty((longest, states), np.float32)
+    product = np.empty((longest, states), np.float32)
     lost = np.empty(longest, np.float32)
-    beta = np.empty(states, np.float32)
-    product = np.empty(states, np.float32)
-    before = np.empty(states, np.float32)
     for b in range(len(start) - 1):
         first, size = start[b], start[b + 1] - start[b]
-        alpha[0, :] = np.float32(1) / np.float32(states)
+        for s in range(states):
+            alpha[0, s] = np.float32(1) / np.float32(states)
+            beta[size, s] = np.float32(1)
         for t in range(size):
-            lost[t] = _likelihoods(evidence[first + t], stray_log[first + t], likely[t])
+            lost[t] = _likelihoods(evidence, first + t, stray_log[first + t], t, likely)
             if t == 0:
-                moved[0, :] = alpha[0]
+                for s in range(states):
+                    moved[0, s] = alpha[0, s]
             else:
-                _move(alpha[t], tables[gap[first + t]], NEGLIGIBLE, moved[t])
-            for s in range(states):
-                # The state of a stray peak is that of the peak before it.
-                alpha[t + 1, s] = moved[t, s] * likely[t, s] + alpha[t, s] * lost[t]
-            _normalise(alpha[t + 1])
-        beta[:] = 1
+                _move(alpha, t, tables, gap[first + t], NEGLIGIBLE, moved)
+            # The state of a stray peak is that of the peak before it.
+            _mix(moved, likely, t, lost[t], alpha)
         for t in range(size - 1, -1, -1):
             bad, good, top = np.float32(0), np.float32(0), np.float32(0)
             for s in range(states):
-                product[s] = likely[t, s] * beta[s]
-                top = max(top, product[s])
-                posterior[first + t, s] = moved[t, s] * product[s]
+                product[t, s] = likely[t, s] * beta[t + 1, s]
+                top = max(top, product[t, s])
+                posterior[first + t, s] = moved[t, s] * product[t, s]
                 good += posterior[first + t, s]
-                bad += alpha[t, s] * lost[t] * beta[s]
+                bad += alpha[t, s] * lost[t] * beta[t + 1, s]
             scale = np.float32(1) / max(good + bad, np.float32(1e-30))
             for s in range(states):
                 posterior[first + t, s] *= scale
             stray[first + t] = bad * scale
             if t > 0:
-                _move(product, turned[gap[first + t]], NEGLIGIBLE * top, before)
-                for s in range(states):
-                    beta[s] = before[s] + beta[s] * lost[t]
-                _normalise(beta)
+                _move(product, t, turned, gap[first + t], NEGLIGIBLE * top, moved)
+                _mix_back(moved, t, lost[t], beta)
 
 
 def best_paths(evidence: Array, start: Ints, gap: Ints, tables: Array, stray_log: Array) -> Ints:
@@ -227,17 +250,23 @@ def best_paths(evidence: Array, start: Ints, gap: Ints, tables: Array, stray_log
 
 
 @kernel
-def _best_sources(score: Array, table: Array, best: Array, source: Ints) -> None:
+def _best_sources(score: Array, logs: Array, g: int, spread: np.float32, best: Array, source: Ints) -> None:
+    """Where each state is best reached from by table g, whose logarithms differ by `spread` at most."""
     states = len(score)
-    best[:] = -np.float32(1e30)
+    top = score[0]
+    for s in range(states):
+        top = max(top, score[s])
+        best[s] = -np.float32(1e30)
     for p in range(states):
-        row = table[p]
         from_here = score[p]
+        # A state worse than the best one by more than that is no state's best source.
+        if from_here < top - spread:
+            continue
         for s in range(states):
-            value = from_here + row[s]
-            if value > best[s]:
-                best[s] = value
-                source[s] = p
+            value = from_here + logs[g, p, s]
+            better = value > best[s]
+            best[s] = value if better else best[s]
+            source[s] = p if better else source[s]
 
 
 @kernel
@@ -250,6 +279,7 @@ def _viterbi(evidence: Array, start: Ints, gap: Ints, logs: Array, stray_log: Ar
     best = np.empty(states, np.float32)
     source = np.empty(states, np.int32)
     keep, lose = np.float32(np.log(1 - STRAY)), np.float32(np.log(STRAY))
+    spread = logs.max() - logs.min()
     for b in range(len(start) - 1):
         first, size = start[b], start[b + 1] - start[b]
         score[:] = 0
@@ -258,7 +288,7 @@ def _viterbi(evidence: Array, start: Ints, gap: Ints, logs: Array, stray_log: Ar
                 best[:] = 0
                 source[:] = np.arange(states)
             else:
-                _best_sources(score, logs[gap[first + t]], best, source)
+                _best_sources(score, logs, gap[first + t], spread, best, source)
             for s in range(states):
                 taken = best[s] + keep + evidence[first + t, s]
                 passed = score[s] + lose + stray_log[first + t]
