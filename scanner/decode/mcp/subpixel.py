@@ -116,14 +116,23 @@ def _smoothed(y: Array, runs: Ints, ends: Ints) -> Array:
     return out
 
 
+# Rows of matrices are named by matrix and number: a slice of its own costs more than the loop over 31 samples.
+
+
 @kernel
-def _straighten(line: Array, centre: np.float32, reach: int, profile: Array) -> None:
-    """profile[u] = line at centre + u - reach, between samples linearly."""
+def _straighten(reduced: Array, b: int, centre: np.float32, p: int, profile: Array) -> None:
+    """profile[p, u] = column b at centre + u - reach, between samples linearly."""
+    samples, size = profile.shape[1], reduced.shape[1]
     base = int(np.floor(centre))
     f = centre - base
-    for u in range(-reach, reach + 1):
-        a = min(max(base + u, 0), len(line) - 2)
-        profile[u + reach] = line[a] + (line[a + 1] - line[a]) * f
+    begin = base - samples // 2
+    if begin >= 0 and begin + samples < size:
+        for u in range(samples):
+            profile[p, u] = reduced[b, begin + u] + (reduced[b, begin + u + 1] - reduced[b, begin + u]) * f
+        return
+    for u in range(samples):
+        a = min(max(begin + u, 0), size - 2)
+        profile[p, u] = reduced[b, a] + (reduced[b, a + 1] - reduced[b, a]) * f
 
 
 @kernel
@@ -134,13 +143,14 @@ def _room(size: int, g: np.float32, above: np.float32, below: np.float32, reach:
 
 
 @summing_kernel
-def _products(mean: Array, reach: int, limit: int, bend: np.float32, sums: Array) -> None:
-    """Sums over the window of shift x shift, shift x slope, slope x slope, odd x shift, odd x slope, odd x odd.
+def _products(mean: Array, reach: int, limit: int, bend: np.float32, p: int, sums: Array) -> None:
+    """sums[p]: over the window shift x shift, shift x slope, slope x slope, odd x shift, odd x slope, odd x odd.
 
     The odd part of the profile `mean`, less what the bend of the surface makes of it, is explained by a shift (the even
     part's derivative) and a slope of brightness (the even part times the distance).
     """
-    sums[:] = 0
+    ss, sv, vv = np.float32(0), np.float32(0), np.float32(0)
+    os, ov, oo = np.float32(0), np.float32(0), np.float32(0)
     for u in range(1, limit):
         right, left = mean[reach + u], mean[reach - u]
         odd = np.float32(0.5) * (right - left)
@@ -148,15 +158,16 @@ def _products(mean: Array, reach: int, limit: int, bend: np.float32, sums: Array
         inner, outer = mean[reach + u - 1] + mean[reach - u + 1], mean[reach + u + 1] + mean[reach - u - 1]
         shift = np.float32(0.25) * (inner - outer)
         odd -= bend * np.float32(u * u) * shift
-        sums[0] += shift * shift
-        sums[1] += shift * slope
-        sums[2] += slope * slope
-        sums[3] += odd * shift
-        sums[4] += odd * slope
-        sums[5] += odd * odd
+        ss += shift * shift
+        sv += shift * slope
+        vv += slope * slope
+        os += odd * shift
+        ov += odd * slope
+        oo += odd * odd
+    sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3], sums[p, 4], sums[p, 5] = ss, sv, vv, os, ov, oo
 
 
-@kernel
+@summing_kernel
 def _slope_at(p: int, count: int, kappa: Array, worth: Array) -> np.float32:
     """The slope of brightness about place `p` of a run, shrunk by its own significance."""
     slope, weight, square = np.float32(0), np.float32(0), np.float32(0)
@@ -179,17 +190,19 @@ def _window_sums(
     profile: Array, ground: Array, usable: Ints, p: int, count: int, bend: np.float32, mean: Array, sums: Array
 ) -> int:
     """Average the profiles about place `p` of a run, and sum their products; returns the samples used to a side."""
-    reach = (profile.shape[1] - 1) // 2
+    samples = profile.shape[1]
     lo, hi = max(p - HALF_COLUMNS, 0), min(p + HALF_COLUMNS, count - 1)
     limit = int(usable[p])
-    mean[:] = 0
+    for u in range(samples):
+        mean[u] = np.float32(0)
     for q in range(lo, hi + 1):
         limit = min(limit, int(usable[q]))
-        for u in range(profile.shape[1]):
+        for u in range(samples):
             mean[u] += profile[q, u] - ground[q]
-    for u in range(profile.shape[1]):
-        mean[u] /= np.float32(hi - lo + 1)
-    _products(mean, reach, limit, bend, sums)
+    share = np.float32(1) / np.float32(hi - lo + 1)
+    for u in range(samples):
+        mean[u] *= share
+    _products(mean, samples // 2, limit, bend, p, sums)
     return limit
 
 
@@ -230,16 +243,16 @@ def _refine(
             k = runs[first + p]
             usable[p] = _room(reduced.shape[1], guess[k], above[k], below[k], reach)
             ground[p] = valley[k]
-            _straighten(reduced[column[k]], guess[k], reach, profile[p])
+            _straighten(reduced, column[k], guess[k], p, profile)
         for p in range(count):
-            used[p] = _window_sums(profile, ground, usable, p, count, bend[runs[first + p]], mean, sums[p])
+            used[p] = _window_sums(profile, ground, usable, p, count, bend[runs[first + p]], mean, sums)
             ss, sv, vv, os, ov = sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3], sums[p, 4]
             determinant = ss * vv - sv * sv
             apart = used[p] >= 4 and determinant > np.float32(1e-4) * ss * vv
             kappa[p] = (ss * ov - sv * os) / determinant if apart else np.float32(0)
             worth[p] = determinant / ss if apart else np.float32(0)
         for p in range(count):
-            ss, sv, vv, os, ov, oo = sums[p]
+            ss, sv, vv, os, ov, oo = sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3], sums[p, 4], sums[p, 5]
             if used[p] < 3 or ss <= 0:
                 continue
             k = runs[first + p]
