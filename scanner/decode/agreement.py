@@ -63,10 +63,25 @@ def agreement(
         floor_cycles: least systematic sigma of a set's phase.
     """
     found = []
-    for j, remainder in enumerate(_remainders(ladder, phases, centre)):
+    for j, remainder in enumerate(remainders_of(ladder, phases, centre)):
         errors2 = ladder.errors[j] ** 2
         low, high = ladder.frequencies[j : j + 2]
         found.append(_remainder(low, high, remainder, errors2 @ cycles2, float(errors2.sum()), floor_cycles))
+    return found
+
+
+def remainders_of(ladder: Ladder, phases: NDArray[np.float32], centre: float) -> list[NDArray[np.float64]]:
+    """What is left of each unwrapping step, (n,) cycles within +-.5, of (K, n) phases; centre: see `agreement`."""
+    m, f = ladder.combinations.astype(np.float64), ladder.frequencies
+    absolute = m[0] @ phases
+    absolute -= np.rint(absolute - f[0] * centre)
+    found = []
+    for j in range(len(f) - 1):
+        psi = m[j + 1] @ phases
+        difference = f[j + 1] / f[j] * absolute - psi
+        order = np.rint(difference)
+        found.append(difference - order)
+        absolute = psi + order
     return found
 
 
@@ -101,7 +116,7 @@ def noise_of_pairs(
     model = default_noise(max_value)
     if len(ladder.errors) == 0:
         return model
-    both = [np.stack(_remainders(ladder, of_one, centre)) for of_one in phases]
+    both = [np.stack(remainders_of(ladder, of_one, centre)) for of_one in phases]
     difference = both[0] - both[1]
     difference -= np.rint(difference)
     per_sample = (ladder.errors**2) @ (per_variance[0] + per_variance[1])
@@ -113,20 +128,6 @@ def noise_of_pairs(
         squares = (difference[use] ** 2 / per_sample[use]).astype(np.float32)
         model = fit_noise(levels[use], squares, 1, max_value)
     return model
-
-
-def _remainders(ladder: Ladder, phases: NDArray[np.float32], centre: float) -> list[NDArray[np.float64]]:
-    m, f = ladder.combinations.astype(np.float64), ladder.frequencies
-    absolute = m[0] @ phases
-    absolute -= np.rint(absolute - f[0] * centre)
-    found = []
-    for j in range(len(f) - 1):
-        psi = m[j + 1] @ phases
-        difference = f[j + 1] / f[j] * absolute - psi
-        order = np.rint(difference)
-        found.append(difference - order)
-        absolute = psi + order
-    return found
 
 
 def _remainder(

@@ -103,7 +103,9 @@ class PmpDecoder:
                 self._decode(axis)
         for axis, found in self._found.items():
             warnings += disagreements(axis, found.remainders)
-            if found.ripple is not None and (ripple := found.ripple.warning(axis)) is not None:
+            if (changes := found.light.flicker) is not None:
+                warnings += tuple(filter(None, [changes.warning(axis, found.random_px)]))
+            if found.ripple is not None and (ripple := found.ripple.warning(axis, found.light)) is not None:
                 warnings += (ripple,)
         warnings += self._found[self._pattern.axes[0]].ladder.warnings()
         return self._decoded(warnings)
@@ -190,6 +192,7 @@ class PmpDecoder:
                 }
                 for axis, found in self._found.items()
             },
+            "light": {axis: found.light.as_dict() for axis, found in self._found.items()},
         }
 
 

@@ -19,7 +19,8 @@ from scanner.decode.neighbours import settle
 from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel
 from scanner.decode.pmp_frames import AxisFrames
 from scanner.decode.pmp_kernels import decode_pixels, join_maps
-from scanner.decode.pmp_sample import PRIOR_FREEDOM, take_sample
+from scanner.decode.pmp_light import Light, judge_light, judge_ripple
+from scanner.decode.pmp_sample import take_sample
 from scanner.decode.reasons import REASONS
 from scanner.decode.strips import in_strips
 from scanner.decode.unwrapping import Ladder, plan_ladder
@@ -109,13 +110,13 @@ class Ripple:
     random_px: float
     """median random 1-sigma of a coordinate, projector px"""
 
-    def warning(self, axis: str) -> str | None:
-        """What a user should know, where the ripple outweighs noise."""
+    def warning(self, axis: str, light: Light) -> str | None:
+        """What a user should know, where the ripple outweighs noise. light: of the same axis, which may name it."""
         if self.cycles < LEAST_RIPPLE_CYCLES or not self.px > self.random_px:
             return None
         return (
             f"ripple along {axis}: frequencies differ by {self.px:.2f} projector px more than noise explains "
-            f"(noise is {self.random_px:.2f} px): measure the response (fringed calibrate response), "
+            f"(noise is {self.random_px:.2f} px){light.named}: measure the response (fringed calibrate response), "
             "take more shifts, or look for light that surfaces throw at one another"
         )
 
@@ -131,6 +132,9 @@ class AxisFound:
     settled: int
     ripple: Ripple | None
     """None with one frequency, which has nothing to differ from"""
+    light: Light
+    random_px: float
+    """median random 1-sigma of a coordinate, projector px"""
     counts: NDArray[np.int64]
     """(REASONS,) pixels by reason"""
 
@@ -156,10 +160,12 @@ def decode_axis(
     ladder = plan_ladder(pattern.frequencies, frames.gains)
     sample = take_sample(frames, pixels, camera.max_value, t.clip(camera), t.min_modulation_levels)
     least = max(t.min_modulation_levels, t.min_modulation_share * sample.brightest(finest))
+    sample, light = judge_light(sample, frames, pattern.frequencies, along, least, t.min_modulation_sigmas)
     noise = sample.noise(ladder, centre, least, t.min_modulation_sigmas)
     remainders = sample.agreement(ladder, noise, centre, least, t.min_modulation_sigmas, t.phase_floor_cycles)
     per_cycle = along / float(ladder.frequencies[-1])
     random_px = per_cycle * sample.phase_sigma(noise, finest, least, t.min_modulation_sigmas)
+    light = judge_ripple(light, sample, ladder, noise, centre, along, least, t.min_modulation_sigmas)
     ripple = None
     if remainders and remainders[-1].pixels >= MIN_PIXELS:
         ripple = _ripple(remainders[-1], float((ladder.errors[-1] ** 2).sum()), per_cycle, random_px)
@@ -170,10 +176,11 @@ def decode_axis(
         frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, frames.whole, t.clip(camera),
         f32(frames.gains), f32(ladder.combinations), f32(ladder.ratios),
         f32(errors2), f32(errors2.sum(axis=1) * systematic**2),
-        f32([noise.read, noise.per_level, ROUNDING_VARIANCE, PRIOR_FREEDOM, 1 / (PRIOR_FREEDOM + frames.freedom)]),
+        f32([noise.read, noise.per_level, ROUNDING_VARIANCE, sample.prior, 1 / (sample.prior + frames.freedom)]),
         f32([along, pattern.origin, ladder.frequencies[0] * centre, ladder.frequencies[-1], centre - 0.5]),
         f32([least, t.min_modulation_sigmas**2, t.max_residual_sigmas**2,
-             t.max_residual_share**2, t.max_remainder_sigmas**2, 1 - t.min_unwrap_probability, t.edge_sigmas]),
+             t.max_residual_share**2 + sample.overtone_share2(finest), t.max_remainder_sigmas**2,
+             1 - t.min_unwrap_probability, t.edge_sigmas]),
         ladder.periodic, finest,
     )  # fmt: skip
     out = (maps.position, maps.sigma, maps.confidence, maps.albedo, maps.modulation, maps.reason)
@@ -190,7 +197,7 @@ def decode_axis(
         settled = settle(maps.position, maps.sigma, maps.confidence, maps.reason, camera.width, per_px)
         counts[Reason.UNWRAP_RISK] -= settled
         counts[Reason.VALUE] += settled
-    return AxisFound(maps, ladder, noise, remainders, settled, ripple, counts)
+    return AxisFound(maps, ladder, noise, remainders, settled, ripple, light, random_px, counts)
 
 
 def _ripple(last: Remainder, weight: float, per_cycle: float, random_px: float) -> Ripple:

@@ -25,7 +25,8 @@ class AxisFrames:
     frames: kept while addresses are in use. addresses: (F,) intp. starts: (K + 1,) intp, where sets begin.
     weights: (3, F) float32 of A, p and q. grams: (K, 6) float32 of the normal matrices. whole: (K,) shifts of sets
     that have all of their 4 or 8, or 0. gains: (K,) variance of (p, q)
-    over that of one sample. freedom: degrees of freedom of all sets' residuals.
+    over that of one sample. freedom: degrees of freedom of all sets' residuals. angles: of each set's shifts, radians;
+    empty for a set that lost some.
     """
 
     frames: Sequence[NDArray[Any]]
@@ -36,6 +37,12 @@ class AxisFrames:
     whole: NDArray[np.intp]
     gains: tuple[float, ...]
     freedom: int
+    angles: tuple[NDArray[np.float64], ...]
+
+    @property
+    def shifts(self) -> tuple[int, ...]:
+        """Of each set that is whole; 0 of one that lost frames."""
+        return tuple(len(alpha) for alpha in self.angles)
 
     @property
     def like(self) -> NDArray[Any]:
@@ -51,6 +58,7 @@ def axis_frames(pattern: PmpPattern, axis: Axis, by_fringe: Mapping[int, NDArray
     """
     frames: list[NDArray[Any]] = []
     starts, weights, grams, whole, gains, freedom = [0], [], [], [], [], 0
+    angles: list[NDArray[np.float64]] = []
     for fringe_set in pattern.sets():
         if fringe_set.axis != axis:
             continue
@@ -64,6 +72,8 @@ def axis_frames(pattern: PmpPattern, axis: Axis, by_fringe: Mapping[int, NDArray
         whole.append(fringe_set.shifts if fringe_set.shifts == len(have) in (4, 8) else 0)
         gains.append(round(float(inverse[1, 1] + inverse[2, 2]) / 2, 9))
         freedom += len(have) - 3
+        alpha = shift_angles(pattern, fringe_set.shifts, have)
+        angles.append(alpha if len(have) == fringe_set.shifts else alpha[:0])
         frames += [by_fringe[fringe_set.first + n] for n in have + have[:1] * padding]
         starts.append(len(frames))
     return AxisFrames(
@@ -75,13 +85,19 @@ def axis_frames(pattern: PmpPattern, axis: Axis, by_fringe: Mapping[int, NDArray
         np.array(whole, np.intp),
         tuple(gains),
         freedom,
+        tuple(angles),
     )
 
 
 def design_matrix(pattern: PmpPattern, shifts: int, have: Sequence[int]) -> NDArray[np.float64]:
-    """(N, 3) rows [1, cos alpha_n, -sin alpha_n], alpha_n = sign 2 pi n / shifts + offset, for the shifts n in `have`.
+    """(N, 3) rows [1, cos alpha_n, -sin alpha_n] for the shifts n in `have`.
 
     I = A + B cos(theta + alpha_n) = [A, B cos theta, B sin theta] . row.
     """
-    alpha = pattern.sign * 2 * np.pi * np.asarray(have) / shifts + pattern.offset
+    alpha = shift_angles(pattern, shifts, have)
     return np.stack([np.ones_like(alpha), np.cos(alpha), -np.sin(alpha)], axis=1)
+
+
+def shift_angles(pattern: PmpPattern, shifts: int, have: Sequence[int]) -> NDArray[np.float64]:
+    """(N,) alpha_n = sign 2 pi n / shifts + offset, radians, for the shifts n in `have`."""
+    return np.asarray(pattern.sign * 2 * np.pi * np.asarray(have) / shifts + pattern.offset)

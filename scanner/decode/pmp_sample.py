@@ -37,6 +37,8 @@ class Sample:
 
     phases, modulations: (K, R, L) float32, cycles and grey levels. mean, residual: (R, L) float32, A and the sum of
     squared residuals. usable: (R, L) bool, not clipped. gains, freedom: of `AxisFrames`. max_value: of the camera.
+    runs: (R,) first pixels. prior: weight of the scan's noise model against a pixel's residual. overtones: what they
+    add to a pixel's squared residual on the average, grey levels squared, where it is not next to nothing.
     """
 
     phases: NDArray[np.float32]
@@ -47,6 +49,9 @@ class Sample:
     gains: NDArray[np.float32]
     freedom: int
     max_value: int
+    runs: NDArray[np.intp]
+    prior: float = PRIOR_FREEDOM
+    overtones: float = 0.0
 
     def brightest(self, finest: int) -> float:
         """99th percentile of the finest set's modulation, grey levels."""
@@ -62,7 +67,7 @@ class Sample:
         """
         if self.freedom:
             return fit_noise(self.mean[self.usable], self.residual[self.usable], self.freedom, self.max_value)
-        good = self._good(default_noise(self.max_value), least, sigmas)
+        good = self.good(default_noise(self.max_value), least, sigmas)
         pair = good[:, :-PAIR_DISTANCE] & good[:, PAIR_DISTANCE:]
         pixels = slice(None, -PAIR_DISTANCE), slice(PAIR_DISTANCE, None)
         phases = np.stack([self.phases[:, :, at][:, pair] for at in pixels])
@@ -75,24 +80,38 @@ class Sample:
         self, ladder: Ladder, noise: NoiseModel, centre: float, least: float, sigmas: float, floor_cycles: float
     ) -> list[Remainder]:
         """How well the ladder's rungs agree where there is enough modulation."""
-        good = self._good(noise, least, sigmas)
+        good = self.good(noise, least, sigmas)
         cycles2 = self._noise_of_b2(noise)[:, good] / (self.modulations[:, good] ** 2 * np.float32(4 * np.pi**2))
         return agreement(ladder, self.phases[:, good], cycles2, centre, floor_cycles)
 
     def phase_sigma(self, noise: NoiseModel, finest: int, least: float, sigmas: float) -> float:
         """Random 1-sigma of the finest set's phase, cycles, median of usable pixels; NaN without any."""
-        good = self._good(noise, least, sigmas)
+        good = self.good(noise, least, sigmas)
         cycles2 = self._noise_of_b2(noise)[finest][good] / (self.modulations[finest][good] ** 2 * 4 * np.pi**2)
         return float(np.sqrt(np.median(cycles2))) if cycles2.size else float("nan")
 
-    def _good(self, noise: NoiseModel, least: float, sigmas: float) -> NDArray[np.bool_]:
+    def good(self, noise: NoiseModel, least: float, sigmas: float) -> NDArray[np.bool_]:
+        """(R, L) bool: pixels not clipped whose sets all have `least` modulation, and `sigmas` times its noise."""
         enough = np.maximum(np.float32(sigmas**2) * self._noise_of_b2(noise), np.float32(max(least**2, 1e-12)))
+        return np.asarray((self.modulations**2 > enough).all(axis=0) & self.usable)
+
+    def overtone_share2(self, finest: int) -> float:
+        """Mean square that overtones leave at the worst phase, over the finest set's B^2 of a typical pixel."""
+        if not self.overtones:
+            return 0.0
+        typical = float(np.median(self.modulations[finest][self.usable] ** 2)) if self.usable.any() else 0.0
+        return 2 * self.overtones / max(self.freedom * typical, 1e-6)
+
+    def lit(self, least: float, sigmas: float) -> NDArray[np.bool_]:
+        """The same before anything is known of the noise: by that of any camera, whatever the residuals."""
+        noise = self.gains[:, None, None] * default_noise(self.max_value).variance(self.mean)
+        enough = np.maximum(np.float32(sigmas**2) * noise, np.float32(max(least**2, 1e-12)))
         return np.asarray((self.modulations**2 > enough).all(axis=0) & self.usable)
 
     def _noise_of_b2(self, noise: NoiseModel) -> NDArray[np.float32]:
         # The plain form of what the kernel does.
         model = noise.variance(self.mean)
-        own = (np.float32(PRIOR_FREEDOM) * model + self.residual) / np.float32(PRIOR_FREEDOM + self.freedom)
+        own = (np.float32(self.prior) * model + self.residual) / np.float32(self.prior + self.freedom)
         return np.asarray(self.gains[:, None, None] * np.maximum(own, model), dtype=np.float32)
 
 
@@ -123,5 +142,5 @@ def _fit(frames: AxisFrames, runs: NDArray[np.intp], length: int, max_value: int
     )  # fmt: skip
     return Sample(
         phases.reshape(sets, *shape), modulations.reshape(sets, *shape), mean.reshape(shape), residual.reshape(shape),
-        ~clipped.reshape(shape), np.array(frames.gains, np.float32), frames.freedom, max_value,
+        ~clipped.reshape(shape), np.array(frames.gains, np.float32), frames.freedom, max_value, runs,
     )  # fmt: skip

@@ -1,0 +1,161 @@
+"""Overtones, ripple and flicker of a PMP scan: found again, told apart from noise, and no cause of false sigmas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scanner.decode import decoder_for
+from scanner.decode.harmonics import height_weights, spectra_of
+from scanner.decode.pmp_frames import axis_frames
+from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
+
+PROJECTOR = ProjectorSize(320, 240)
+CAMERA = CameraFormat(240, 160)
+
+
+def rows_seen():
+    y, x = np.mgrid[: CAMERA.height, : CAMERA.width] / np.array(CAMERA.shape)[:, None, None]
+    return 10 + 215 * y + 9 * np.sin(5 * x)
+
+
+def shown(pattern, exponent=1.0, noise=0.8, lights=None, camera=CAMERA, seed=3):
+    """Frames of a bent board under light ^ exponent; lights: of each frame, over the others'."""
+    random, rows, frames = np.random.default_rng(seed), rows_seen(), []
+    top = camera.max_value / 255
+    for s in pattern.sets():
+        for n in range(s.shifts):
+            angle = 2 * np.pi * s.frequency * (rows + pattern.origin) / PROJECTOR.height - 2 * np.pi * n / s.shifts
+            grey = 8 + 190 * (0.5 + 0.48 * np.cos(angle)) ** exponent
+            grey = grey * (1 if lights is None else lights[len(frames)]) + random.normal(0, noise, camera.shape)
+            frames.append(np.rint(np.clip(grey, 0, 255) * top).astype(camera.dtype))
+    return frames
+
+
+def decoded(pattern, frames, camera=CAMERA):
+    decoder = decoder_for(PatternSequence(PROJECTOR, pattern), camera)
+    for position, frame in enumerate(frames):
+        decoder.add(position, frame)
+    return decoder.finish()
+
+
+def of_set(found, k=-1):
+    return found.details["light"]["y"]["harmonics"][k]
+
+
+def shares_of(exponent):
+    """Of the overtones 2, 3, 4 in the fringe, by Fourier transform."""
+    light = (0.5 + 0.48 * np.cos(2 * np.pi * np.arange(4096) / 4096)) ** exponent
+    lines = np.abs(np.fft.rfft(light))
+    return lines[2:5] / lines[1]
+
+
+@pytest.mark.parametrize("bits", [8, 12])
+@pytest.mark.parametrize("shifts", [3, 4, 5, 6, 8, 9])
+def test_the_kernel_sums_what_the_plain_form_does(shifts, bits):
+    camera = CameraFormat(CAMERA.width, CAMERA.height, bits)
+    pattern = PmpPattern(("y",), (1.0,), (shifts,), offset=0.4)
+    frames = shown(pattern, 1.7, camera=camera)
+    of_axis = axis_frames(pattern, "y", dict(enumerate(frames)))
+    runs, length = np.arange(0, CAMERA.width * CAMERA.height, 96), 64
+    pixels = (runs[::2, None] + np.arange(length)).reshape(-1)
+    good = np.random.default_rng(1).random((runs.size, length)) < 0.7
+    samples = np.stack([frame.reshape(-1)[pixels] for frame in frames])[:, good[::2].reshape(-1)].astype(float)
+    level = np.broadcast_to(np.mean(frames, axis=(0, 1, 2)).astype(np.float32), good.shape).copy()
+    (found,) = spectra_of(of_axis, runs, 2, good, level)
+    alpha = of_axis.angles[0]
+    heights = 2 / shifts * np.exp(-1j * np.arange(1, 5)[:, None] * alpha) @ samples
+    assert found.power == pytest.approx(np.mean(np.abs(heights[0]) ** 2), rel=1e-5)
+    assert len(found.ratios) == max(min(4, shifts // 2) - 1, 0)
+    for order, (ratio, left) in enumerate(zip(found.ratios, found.left, strict=True), start=2):
+        meant, seen = heights[0] * np.exp(1j * (order - 1) * np.angle(heights[0])), heights[order - 1]
+        if 2 * order == shifts:
+            seen = (seen * np.exp(1j * order * alpha[0])).real / 2
+            both = np.linalg.lstsq(np.stack([meant.real, -meant.imag], 1), seen, rcond=None)[0]
+            expected, rest = complex(*both), np.mean(seen - np.stack([meant.real, -meant.imag], 1) @ both)
+        else:
+            expected = np.vdot(meant, seen) / np.vdot(meant, meant).real
+            rest = np.mean(seen - expected * meant)
+        assert ratio == pytest.approx(expected, abs=1e-4)
+        assert left == pytest.approx(rest / level[0, 0], abs=1e-4)
+    assert height_weights(alpha).dtype == np.float32
+
+
+@pytest.mark.parametrize("exponent", [0.7, 1.0, 1.15, 2.2])
+def test_overtones_are_told_by_their_shares(exponent):
+    pattern = PmpPattern(("y",), (1.0, 8.0, 24.0), (8, 8, 8))
+    found = decoded(pattern, shown(pattern, exponent))
+    for k in range(3):
+        told = of_set(found, k)
+        assert [told["second"], told["third"], told["fourth"]] == pytest.approx(shares_of(exponent), abs=0.004)
+        assert told["sigma"] < 0.002
+    assert found.details["light"]["y"]["flicker"]["frames"] < 0.004
+
+
+@pytest.mark.parametrize(("shifts", "exponent"), [(4, 1.3), (6, 2.2), (8, 1.1), (8, 2.2)])
+def test_what_the_response_does_is_not_taken_for_noise(shifts, exponent):
+    """A sigma twelve times too large, and coverage lost to it, is what eight shifts of gamma 2.2 once gave."""
+    pattern = PmpPattern(("y",), (1.0, 8.0, 24.0), (shifts,) * 3)
+    one, two = (decoded(pattern, shown(pattern, exponent, seed=seed)) for seed in (1, 2))
+    both = np.isfinite(one.rows) & np.isfinite(two.rows)
+    assert both.mean() > 0.99
+    apart = (one.rows - two.rows)[both] / np.hypot(one.sigma_rows, two.sigma_rows)[both]
+    assert 0.60 < np.mean(np.abs(apart) < 1) < 0.76
+    assert 0.92 < np.mean(np.abs(apart) < 2) < 0.98
+
+
+@pytest.mark.parametrize(("shifts", "named"), [(3, "second"), (4, "third")])
+def test_overtones_that_pass_for_the_fringe_are_told_by_the_ripple(shifts, named):
+    pattern = PmpPattern(("y",), (1.0, 8.0, 24.0), (shifts,) * 3)
+    exponent = 1.3 if shifts == 3 else 2.2
+    found = decoded(pattern, shown(pattern, exponent, noise=0.3))
+    told = of_set(found)
+    assert told[named] == pytest.approx(shares_of(exponent)[1 if named == "third" else 0], rel=0.25)
+    rms = np.sqrt(np.nanmean((found.rows - rows_seen()) ** 2))
+    assert told["ripple_px"] == pytest.approx(np.sqrt(max(rms**2 - np.nanmedian(found.sigma_rows) ** 2, 0)), rel=0.3)
+    assert of_set(decoded(pattern, shown(pattern, 1.0, noise=0.3)))["ripple_px"] < 0.02
+
+
+@pytest.mark.parametrize("share", [0.0, 0.03])
+def test_light_that_changes_from_frame_to_frame_is_flicker(share):
+    pattern = PmpPattern(("y",), (1.0, 8.0, 24.0), (8, 8, 8))
+    lights = 1 + share * np.random.default_rng(4).normal(size=24)
+    found = decoded(pattern, shown(pattern, lights=lights))
+    flicker = found.details["light"]["y"]["flicker"]
+    if share:
+        assert flicker["frames"] == pytest.approx(share, rel=0.35)
+        assert flicker["sets"] == pytest.approx(share / np.sqrt(8), rel=0.8)
+        assert flicker["px"] == pytest.approx(share / 0.9 * np.sqrt(2 / 8) * 10 / (2 * np.pi), rel=0.4)
+        assert any("flicker along y: the light changes by" in warning for warning in found.warnings)
+    else:
+        assert flicker["frames"] < 0.003
+        assert not found.warnings
+
+
+def test_frames_that_changed_places_are_no_response():
+    """Their overtones are too high, or higher than those of the order before: they stay in the residual."""
+    pattern = PmpPattern(("y",), (1.0, 8.0, 24.0), (4, 4, 4))
+    frames = shown(pattern, 2.2)
+    frames[5], frames[6] = frames[6], frames[5]
+    of_axis = axis_frames(pattern, "y", dict(enumerate(frames)))
+    good = np.ones((100, 64), np.bool_)
+    spectra = spectra_of(of_axis, np.arange(100) * 300, 1, good, np.full(good.shape, 90, np.float32))
+    assert [s.of_response for s in spectra] == [True, False, True]
+    assert spectra[1].energy == 0
+
+
+def test_sets_that_lost_frames_and_dark_images_tell_nothing():
+    pattern = PmpPattern(("y",), (1.0, 8.0), (8, 8))
+    frames = dict(enumerate(shown(pattern)))
+    del frames[3]
+    of_axis = axis_frames(pattern, "y", frames)
+    assert of_axis.shifts == (0, 8)
+    good = np.ones((100, 64), np.bool_)
+    level = np.full(good.shape, 90, np.float32)
+    lost, whole = spectra_of(of_axis, np.arange(100) * 300, 1, good, level)
+    assert lost is None
+    assert whole is not None
+    assert spectra_of(of_axis, np.arange(100) * 300, 1, good & False, level) == (None, None)
+    dark = decoded(pattern, [np.full(CAMERA.shape, 5, np.uint8)] * 16)
+    assert of_set(dark)["second"] is None
+    assert dark.details["light"]["y"]["flicker"] is None
