@@ -31,6 +31,8 @@ DISC_ROUNDS = 3
 """Of adjustment and the discs' eccentricity in turn."""
 DRAWS = 24
 """Triples of views that are tried: with three bad ones in eight, a triple of good ones is missed once in a hundred."""
+HOPELESS_SHARE = 0.01
+"""Of the picture's width that a start may leave: more is no lens and no target, and adjusting it takes long."""
 GROWN = 3
 """Triples, the best, from which groups are grown: of few views one with a bad one may fit by chance."""
 
@@ -177,6 +179,8 @@ def _fitted(problem: Problem, rounds: int = ROUNDS) -> Agreed | None:
     """All views of a problem, with a start of their own; None where there is none."""
     try:
         begun = start(problem.target, problem.views, problem.camera_size, problem.projector_size, leave_out=False)
+        if begun.camera_px > HOPELESS_SHARE * problem.camera_size[0]:
+            return None
         return Agreed(*_adjusted(problem, begun.state, rounds))
     except CalibrationError:
         return None

@@ -34,11 +34,13 @@ BAD_START_PX = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """state: of the views that are used; used: their positions; left_out: position -> why."""
+    """state: of the views that are used; used: their positions; left_out: position -> why; camera_px: rms that is left
+    in the camera's picture of the view with most."""
 
     state: State
     used: tuple[int, ...]
     left_out: dict[int, str]
+    camera_px: float
 
 
 def start(
@@ -70,7 +72,9 @@ def start(
         position, why = bad
         left_out[used.pop(position)] = why
     sheet = np.array([1.0, 1.0, 0.0])
-    return Start(State(camera, projector, rotation, translation, sheet, poses), tuple(used), left_out)
+    return Start(
+        State(camera, projector, rotation, translation, sheet, poses), tuple(used), left_out, float(errors.max())
+    )
 
 
 def _worst(errors: Array, side: str) -> tuple[int, str] | None:

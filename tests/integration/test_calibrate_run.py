@@ -21,16 +21,26 @@ POSES = 3
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A rig that knows its latency, so that no test waits for its measurement."""
+    """A fast rig that knows its latency, so that no test waits for either."""
     path = tmp_path_factory.mktemp("rig") / "rig.toml"
-    device = "quick/chessboard_poses?walk=true"
+    device = "quick/chessboard_poses?walk=true&exposure_scale=4"
     path.write_text(
         f'[rig]\nname = "walk"\n[camera]\ndriver = "simulated"\ndevice = "{device}"\n'
         f'[projector]\ndriver = "simulated"\ndevice = "{device}"\nlatency_us = [4000, 4400]\nsettle_us = [100, 300]\n'
+        "[projector.options]\nrefresh_ns = 8_000_000\n"
+        "[camera.options]\nreadout_us = 1000\n[camera.settings]\nexposure_us = 8000\n"
     )
     return path
 
 
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A picture every twelfth of a second, and a target that counts as still after a fifth."""
+    monkeypatch.setattr("service.guided_calibration.PREVIEW_HZ", 12.0)
+    monkeypatch.setattr("scanner.calibration.guide.STILL_S", 0.2)
+
+
+@pytest.mark.usefixtures("quick")
 def test_a_rig_is_calibrated_by_itself(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "calibration"
     words = ["calibrate", "run", str(rig), "--target", TARGET, "-o", str(folder)]

@@ -142,15 +142,17 @@ def test_command_leaves_no_file_of_a_failed_solve(
     assert main(["calibrate", "solve", *pair, "--target", SPEC, "-o", str(file)]) == 1
     assert "2 of 2 captures can be used, 3 are needed" in capsys.readouterr().err
     wrong = ["--target", "chessboard:9x6:30", "--baseline", "150"]
-    assert main(["calibrate", "solve", str(poses), *wrong, "-o", str(file)]) == 1
-    assert "squares (spacing) of 18.99" in capsys.readouterr().err
+    four = [str(poses / f"p{k:02d}") for k in (0, 2, 4, 6)]
+    assert main(["calibrate", "solve", *four, *wrong, "-o", str(file)]) == 1
+    assert "squares (spacing) of 18.9" in capsys.readouterr().err
     assert main(["calibrate", "solve", str(poses), "--target", "chess:1", "-o", str(file)]) == 1
     assert main(["calibrate", "solve", str(poses), "--target", SPEC, "--length", "x", "-o", str(file)]) == 2
     assert list(tmp_path.iterdir()) == []
 
 
 def test_command_shows_views_and_warnings(poses: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["calibrate", "solve", str(poses), "--target", SPEC, "-o", str(tmp_path / "rig.json"), "--no-picture"]
+    some = [str(poses / name) for name in ("p00", "p02", "p04", "late")]
+    words = ["calibrate", "solve", *some, "--target", SPEC, "-o", str(tmp_path / "rig.json"), "--no-picture"]
     assert main(words) == 0
     shown = capsys.readouterr()
     assert "scale unverified" in shown.out
