@@ -23,7 +23,7 @@ POSES = 3
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A fast rig that knows its latency, so that no test waits for either."""
     path = tmp_path_factory.mktemp("rig") / "rig.toml"
-    device = "quick/chessboard_poses?walk=true&exposure_scale=4"
+    device = "quick/chessboard_poses?walk=true&exposure_scale=2"
     path.write_text(
         f'[rig]\nname = "walk"\n[camera]\ndriver = "simulated"\ndevice = "{device}"\n'
         f'[projector]\ndriver = "simulated"\ndevice = "{device}"\nlatency_us = [4000, 4400]\nsettle_us = [100, 300]\n'
