@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.capture import CaptureHeader
-from scanner.decode import Decoded, Decoder, Reason, SeriesDecoder, decoder_for
+from scanner.decode import Decoded, Decoder, PositionsDecoder, SeriesDecoder, decoder_for
 from scanner.devices import Pixels
 from scanner.errors import CalibrationError, DecodeError
 from scanner.geometry import Calibration
@@ -105,14 +105,7 @@ class LiveReconstruction:
         Raises:
             DecodeError: it shows no pattern, or another one.
         """
-        if self._used:
-            if self._follow and isinstance(self._decoder, SeriesDecoder):
-                self._decoder.next_frame()
-            else:
-                self._decoder = self._new_decoder()
-        self._used = True
-        self._decoder.add(0, frame)
-        return self._decoder.finish()
+        return self._given(frame).finish()
 
     def result(self, frame: Pixels) -> LiveResult:
         """One frame to what is published.
@@ -120,15 +113,12 @@ class LiveReconstruction:
         Raises:
             DecodeError: it shows no pattern, or another one.
         """
-        decoded = self.decode(frame)
         if self._xyz and self._calibration is not None:
+            decoded = self.decode(frame)
             xyz = filtered_points(decoded, self._calibration, self._options.filters).xyz
             count = int(np.count_nonzero(~np.isnan(xyz[..., 2])))
             return LiveResult(np.ascontiguousarray(xyz[:: self._stride, :: self._stride]), count)
-        rows = decoded.rows if self.axis == "y" else decoded.columns
-        if rows is None:
-            raise AssertionError("an MCP decoder gives the axis of its pattern")
-        return LiveResult(quantised(rows, self.scale), int(np.count_nonzero(decoded.reason == Reason.VALUE)))
+        return LiveResult(*quantised(self._positions(frame), self.scale))
 
     def scan(self, frame: Pixels) -> Scan:
         """One frame to a whole scan, as decoding a capture gives it; for recordings.
@@ -139,6 +129,27 @@ class LiveReconstruction:
         """
         return build_scan(self.decode(frame), self._calibration, self._options.filters)
 
+    def _given(self, frame: Pixels) -> Decoder:
+        """The decoder, which has been given this frame alone."""
+        if self._used:
+            if self._follow and isinstance(self._decoder, SeriesDecoder):
+                self._decoder.next_frame()
+            else:
+                self._decoder = self._new_decoder()
+        self._used = True
+        self._decoder.add(0, frame)
+        return self._decoder
+
+    def _positions(self, frame: Pixels) -> Map:
+        decoder = self._given(frame)
+        if isinstance(decoder, PositionsDecoder):
+            return decoder.positions()
+        decoded = decoder.finish()
+        rows = decoded.rows if self.axis == "y" else decoded.columns
+        if rows is None:
+            raise AssertionError("an MCP decoder gives the axis of its pattern")
+        return rows
+
     def _new_decoder(self) -> Decoder:
         return decoder_for(self._header.sequence, self._header.camera, self._options.decoder)
 
@@ -148,21 +159,32 @@ def row_scale(length: int) -> float:
     return float(LARGEST // length)
 
 
-def quantised(rows: Map, scale: float) -> NDArray[np.uint16]:
-    """Rows, (H, W) float32 px, NaN = none, to (H, W) uint16: round((row + 0.5) * scale) within 1 .. 65535, 0 = none."""
+def quantised(rows: Map, scale: float) -> tuple[NDArray[np.uint16], int]:
+    """Rows for the wire, and how many there are.
+
+    Args:
+        rows: (H, W) float32 px, NaN = none.
+        scale: steps a pixel.
+
+    Returns:
+        (H, W) uint16, round((row + 0.5) * scale) within 1 .. 65535, 0 = none; number of values that are not 0.
+    """
     values = np.empty(rows.shape, np.uint16)
-    _quantise(np.ascontiguousarray(rows), np.float32(scale), values)
-    return values
+    count = _quantise(np.ascontiguousarray(rows).reshape(-1), np.float32(scale), values.reshape(-1))
+    return values, int(count)
 
 
 @kernel
-def _quantise(rows: Map, scale: np.float32, values: NDArray[np.uint16]) -> None:
-    for i in range(rows.shape[0]):
-        for j in range(rows.shape[1]):
-            value = (rows[i, j] + np.float32(0.5)) * scale + np.float32(0.5)
-            # A value is never 0, which means none.
-            missing = np.isnan(value)
-            values[i, j] = 0 if missing else np.uint16(min(max(value, np.float32(1)), np.float32(65535)))
+def _quantise(rows: Map, scale: np.float32, values: NDArray[np.uint16]) -> int:
+    missing = 0
+    for i in range(len(rows)):
+        value = (rows[i] + np.float32(0.5)) * scale + np.float32(0.5)
+        # A value is never 0, which means none.
+        none = value != value  # noqa: PLR0124  (NaN alone differs from itself)
+        whole = np.int32(min(max(value, np.float32(1)), np.float32(LARGEST)))
+        values[i] = np.uint16(np.int32(0) if none else whole)
+        missing += none
+    return len(rows) - missing
 
 
 def warm_up() -> None:

@@ -92,6 +92,18 @@ class SeriesDecoder(Decoder, Protocol):
         """Make ready for another frame list; frames taken so far are forgotten."""
 
 
+@runtime_checkable
+class PositionsDecoder(Decoder, Protocol):
+    """A decoder that can give rows or columns alone, in less time: for those who use no other map."""
+
+    def positions(self) -> Map:
+        """In place of `finish`: its rows, or its columns where the pattern's axis is "x".
+
+        Raises:
+            DecodeError: as `finish`.
+        """
+
+
 DECODERS: Mapping[str, tuple[str, ...]] = {"mcp": ("default", "casey2011")}
 """Decoders by name, of methods that have more than the default one."""
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scanner.decode import Decoded, Reason, SeriesDecoder, decoder_for
+from scanner.decode import Decoded, PositionsDecoder, Reason, SeriesDecoder, decoder_for
 from scanner.decode.mcp import McpDecoder, decode_image
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, PmpPattern, ProjectorSize
@@ -269,6 +269,23 @@ def test_a_series_searches_once_and_gives_what_single_frames_give(turned):
     assert not searched(third)
     np.testing.assert_array_equal(third.rows, first.rows)
     np.testing.assert_array_equal(third.peaks, second.peaks)
+
+
+@pytest.mark.parametrize("case", ["rows", "columns", "upside down"])
+def test_positions_alone_are_those_of_the_maps(case):
+    pattern = replace(OWN, axis="x" if case == "columns" else "y")
+    camera = CAMERA if pattern.axis == "y" else CameraFormat(CAMERA.height, CAMERA.width)
+    frame, _ = render(pattern, camera=camera)
+    frame = np.ascontiguousarray(frame[::-1]) if case == "upside down" else frame
+    whole = decode_image(frame, pattern, sizes(pattern), camera)
+    decoder = decoder_for(PatternSequence(sizes(pattern), pattern), camera)
+    assert isinstance(decoder, PositionsDecoder)
+    with pytest.raises(DecodeError, match="missing"):
+        decoder.positions()
+    decoder.add(0, frame)
+    alone = decoder.positions()
+    np.testing.assert_array_equal(alone, whole.rows if pattern.axis == "y" else whole.columns)
+    assert alone.flags.c_contiguous
 
 
 def test_a_change_of_scene_or_a_dark_frame_is_searched_anew():

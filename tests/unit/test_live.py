@@ -196,7 +196,8 @@ def test_a_series_names_only_folders_beside_it(tmp_path: Path, name: str) -> Non
 def test_rows_cross_the_wire_to_half_a_step(values: list[float | None]) -> None:
     rows = np.array([[np.nan if v is None else v for v in values]], np.float32)
     scale = row_scale(864)
-    sent = quantised(rows, scale)
+    sent, count = quantised(rows, scale)
+    assert count == np.count_nonzero(sent)
     # The plain form: round half up, at least 1, 0 = none.
     plain = np.nan_to_num(np.clip(np.floor((rows + np.float32(0.5)) * np.float32(scale) + np.float32(0.5)), 1, 65535))
     np.testing.assert_array_equal(sent, plain.astype(np.uint16))
@@ -247,7 +248,7 @@ def test_pictures_of_rows_and_of_nothing(tmp_path: Path) -> None:
     rows = 2 * y + 0.5 * x
     np.testing.assert_allclose(relief(rows), 0, atol=1e-3)
     rows[20:30, 20:30] = np.nan
-    frame = LiveWatch("run").result(encode_live(head(0, width=80, height=60), quantised(rows, 75.0).data.cast("B")))
+    frame = LiveWatch("run").result(encode_live(head(0, width=80, height=60), quantised(rows, 75.0)[0].data.cast("B")))
     assert frame is not None
     assert encoded(live_picture(frame), ".png").startswith(b"\x89PNG")
     empty = LiveWatch("run").result(encode_live(head(0, width=0, height=0, error="no stripes"), b""))

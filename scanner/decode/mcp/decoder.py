@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scanner.decode import Decoded
 from scanner.decode.frames import FrameCheck
 from scanner.decode.mcp.decision import Decision, decide
-from scanner.decode.mcp.door import grey, turned_back, upright_image, upside_down
-from scanner.decode.mcp.locate import Found, Image, Known, Stages, locate
-from scanner.decode.mcp.maps import maps_of
+from scanner.decode.mcp.door import grey, turned, turned_back, upright_image, upside_down
+from scanner.decode.mcp.locate import Array, Found, Image, Known, Stages, locate
+from scanner.decode.mcp.maps import maps_of, rows_of
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.white import RATIO_BITS, divided, in_grey_levels
 from scanner.errors import DecodeError
@@ -64,44 +64,82 @@ def decode_next(
     Raises:
         DecodeError: as `decode_image`.
     """
-    pattern.validate(projector)
-    upright = upright_image(image, pattern, camera)
-    model = PatternModel.of(pattern, projector)
-    result = None if known is None else _by_what_is_known(upright, model, camera, known)
-    decoded, learnt = result or _decode_anew(upright, model, camera)
+    seen, learnt = _see(image, pattern, projector, camera, known)
+    decoded = maps_of(seen.image, seen.found, seen.decided, seen.model, seen.clock)
+    decoded = upside_down(decoded) if seen.upside_down else decoded
     return decoded if pattern.axis == "y" else turned_back(decoded), learnt
 
 
-def _by_what_is_known(
-    upright: Image, model: PatternModel, camera: CameraFormat, known: Known
-) -> tuple[Decoded, Known] | None:
+def positions_next(
+    image: NDArray[np.uint8] | NDArray[np.uint16],
+    pattern: McpPattern,
+    projector: ProjectorSize,
+    camera: CameraFormat,
+    known: Known | None,
+) -> tuple[Array, Known]:
+    """`decode_next` for those who want rows (axis "x": columns) and no other map: (H, W) float32, NaN where undecided.
+
+    Raises:
+        DecodeError: as `decode_image`.
+    """
+    seen, learnt = _see(image, pattern, projector, camera, known)
+    rows = rows_of(seen.image, seen.found, seen.decided, seen.model)
+    rows = np.ascontiguousarray(rows[::-1]) if seen.upside_down else rows
+    return rows if pattern.axis == "y" else turned(rows), learnt
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """An image whose stripes have been decided; `image` is upright: stripes horizontal, the first one above."""
+
+    image: Image
+    found: Found
+    decided: Decision
+    model: PatternModel
+    upside_down: bool
+    clock: Stages
+
+
+def _see(
+    image: NDArray[Any], pattern: McpPattern, projector: ProjectorSize, camera: CameraFormat, known: Known | None
+) -> tuple[_Seen, Known]:
+    pattern.validate(projector)
+    upright = upright_image(image, pattern, camera)
+    model = PatternModel.of(pattern, projector)
+    seen = None if known is None else _by_what_is_known(upright, model, camera, known)
+    if seen is not None and known is not None:
+        return seen, known
+    seen = _see_anew(upright, model, camera)
+    return seen, _learnt(seen.found, seen.decided, upside_down=seen.upside_down)
+
+
+def _by_what_is_known(upright: Image, model: PatternModel, camera: CameraFormat, known: Known) -> _Seen | None:
     """None where it does not hold any more."""
     clock = Stages()
-    seen = np.ascontiguousarray(upright[::-1]) if known.upside_down else upright
-    found = locate(seen, model, camera, clock, known)
+    image = np.ascontiguousarray(upright[::-1]) if known.upside_down else upright
+    found = locate(image, model, camera, clock, known)
     if found.fault is not None:
         return None
     decided = decide(found, model, clock)
     if not decided.agreement.holds or not known.still_holds(_learnt(found, decided, upside_down=known.upside_down)):
         return None
-    decoded = maps_of(seen, found, decided, model, clock)
-    return upside_down(decoded) if known.upside_down else decoded, known
+    return _Seen(image, found, decided, model, known.upside_down, clock)
 
 
-def _decode_anew(upright: Image, model: PatternModel, camera: CameraFormat) -> tuple[Decoded, Known]:
+def _see_anew(upright: Image, model: PatternModel, camera: CameraFormat) -> _Seen:
     clock = Stages()
     found = locate(upright, model, camera, clock)
     if found.fault is not None:
         _explain(found, upright, model, camera)
     decided = decide(found, model, clock)
     if decided.agreement.holds:
-        return maps_of(upright, found, decided, model, clock), _learnt(found, decided, upside_down=False)
+        return _Seen(upright, found, decided, model, False, clock)
     # The projector may hang upside down: then the stripes' order is reversed.
-    turned = np.ascontiguousarray(upright[::-1])
-    found = locate(turned, model, camera, clock)
+    reversed_image = np.ascontiguousarray(upright[::-1])
+    found = locate(reversed_image, model, camera, clock)
     again = decide(found, model, clock) if found.fault is None else decided
     if again.agreement.holds:
-        return upside_down(maps_of(turned, found, again, model, clock)), _learnt(found, again, upside_down=True)
+        return _Seen(reversed_image, found, again, model, True, clock)
     _refuse_turned(upright, model, camera)
     a = max(decided.agreement, again.agreement, key=lambda agreement: agreement.agree)
     if a.exchanged:
@@ -174,25 +212,37 @@ class McpDecoder:
     def finish(self) -> Decoded:
         """The maps; see `scanner.decode.Decoder`."""
         known, self._known = self._known, None  # a frame that is refused teaches nothing
-        size = self._sequence.projector
+        image, camera = self._to_decode()
+        decoded, self._known = decode_next(image, self._pattern, self._sequence.projector, camera, known)
         if self._white is None:
-            decoded, self._known = decode_next(self.frame(), self._pattern, size, self._camera, known)
             return decoded
-        image, white, black = (
-            None if frame is None else grey(frame, self._camera) for frame in (self._image, self._white, self._black)
-        )
-        if image is None or white is None:
-            self.frame()
-            raise AssertionError("frame() raises without the MCP frame")
-        camera = CameraFormat(self._camera.width, self._camera.height, RATIO_BITS)
-        ratio = divided(image, white, black, self._camera.max_value)
-        decoded, self._known = decode_next(ratio, self._pattern, size, camera, known)
+        white = grey(self._white, self._camera)
+        black = None if self._black is None else grey(self._black, self._camera)
         return replace(
             decoded,
             albedo=in_grey_levels(decoded.albedo, white, black),
             modulation=in_grey_levels(decoded.modulation, white, black),
             details={**decoded.details, "divided_by_white": True},
         )
+
+    def positions(self) -> Array:
+        """Rows or columns alone; see `scanner.decode.PositionsDecoder`."""
+        known, self._known = self._known, None
+        image, camera = self._to_decode()
+        rows, self._known = positions_next(image, self._pattern, self._sequence.projector, camera, known)
+        return rows
+
+    def _to_decode(self) -> tuple[NDArray[Any], CameraFormat]:
+        """The one image that holds the pattern alone."""
+        if self._white is None:
+            return self.frame(), self._camera
+        if self._image is None:
+            self.frame()
+            raise AssertionError("frame() raises without the MCP frame")
+        image, white = grey(self._image, self._camera), grey(self._white, self._camera)
+        black = None if self._black is None else grey(self._black, self._camera)
+        camera = CameraFormat(self._camera.width, self._camera.height, RATIO_BITS)
+        return divided(image, white, black, self._camera.max_value), camera
 
     def frame(self) -> NDArray[Any]:
         """The one frame, the black one taken off where there is one.
@@ -215,7 +265,7 @@ def _explain(found: Found, image: Image, model: PatternModel, camera: CameraForm
 def _refuse_turned(image: Image, model: PatternModel, camera: CameraFormat) -> None:
     """Raise DecodeError if the pattern is there, codes and all, once the image is turned."""
     clock = Stages()
-    found = locate(np.ascontiguousarray(image.T), model, camera, clock)
+    found = locate(turned(image), model, camera, clock)
     if found.fault is None and decide(found, model, clock).agreement.holds:
         raise DecodeError(
             "the pattern is turned by 90 degrees: its stripes run the other way",

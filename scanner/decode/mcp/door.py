@@ -31,10 +31,14 @@ def upright_image(image: NDArray[Any], pattern: McpPattern, camera: CameraFormat
     """Checked, grey, with horizontal stripes, contiguous."""
     _check_frame(image, camera, 0)
     image = grey(image, camera)
-    turned = image if pattern.axis == "y" else image.T
-    if min(turned.shape) < 32:
+    if min(image.shape) < 32:
         raise DecodeError(f"an image of {image.shape[1]} x {image.shape[0]} is smaller than a few stripes")
-    return np.ascontiguousarray(turned)
+    return np.ascontiguousarray(image) if pattern.axis == "y" else turned(image)
+
+
+def turned(array: NDArray[Any]) -> NDArray[Any]:
+    """(H, W) to (W, H), contiguous."""
+    return np.ascontiguousarray(array.T)
 
 
 def grey(image: NDArray[Any], camera: CameraFormat) -> Image:
@@ -63,7 +67,7 @@ def turned_back(decoded: Decoded) -> Decoded:
     peaks = decoded.peaks
     if peaks is not None:
         peaks[:, :2] = peaks[:, 1::-1]
-    upright = _with_maps(decoded, lambda array: array.T)
+    upright = _with_maps(decoded, turned)
     return replace(upright, rows=None, sigma_rows=None, columns=upright.rows, sigma_columns=upright.sigma_rows)
 
 

@@ -20,22 +20,9 @@ def maps_of(image: Image, found: Found, decided: Decision, model: PatternModel, 
         found, decided, model: as elsewhere.
         clock: takes the stages' times, and reports them.
     """
-    peaks, chains, _, _ = found.parts()
-    keep = (decided.label >= 0) & (decided.fine.whole > 0) & (peaks.clear > 0)
-    label = np.where(keep, decided.label, -1).astype(np.int32)
-    row = ((label + 0.5) * model.pitch - 0.5).astype(np.float32)
-    counts = np.bincount(chains.column[keep], minlength=len(peaks.start) - 1)
-    slope = model.pitch / found.pitch
-    knots = dense.Knots(
-        np.concatenate(([0], np.cumsum(counts))).astype(np.int32),
-        decided.fine.y[keep],
-        row[keep],
-        (decided.fine.sigma[keep] * slope).astype(np.float32),
-        decided.confidence[keep],
-        decided.light[keep],
-        peaks.height[keep],
-        label[keep],
-    )
+    chains = found.parts()[1]
+    label, knots = _knots(found, decided, model)
+    keep = label >= 0
     with clock.stage("dense rows"):
         maps = dense.interpolate(knots, (image.shape[0], image.shape[1]), found.pitch, model.pitch)
         marked = dense.stripe_map(decided.fine.y, label, chains, (image.shape[0], image.shape[1]))
@@ -64,6 +51,32 @@ def maps_of(image: Image, found: Found, decided: Decision, model: PatternModel, 
         peaks=peak_table,
         warnings=tuple(warnings),
         details=figures,
+    )
+
+
+def rows_of(image: Image, found: Found, decided: Decision, model: PatternModel) -> Array:
+    """`maps_of`'s rows alone: (H, W) float32, NaN where undecided."""
+    _, knots = _knots(found, decided, model)
+    return dense.rows_alone(knots, (image.shape[0], image.shape[1]), found.pitch, model.pitch)
+
+
+def _knots(found: Found, decided: Decision, model: PatternModel) -> tuple[NDArray[np.int32], dense.Knots]:
+    """Stripe of each peak that is kept, -1 of the others (P,) int32, and the kept ones."""
+    peaks, chains, _, _ = found.parts()
+    keep = (decided.label >= 0) & (decided.fine.whole > 0) & (peaks.clear > 0)
+    label = np.where(keep, decided.label, -1).astype(np.int32)
+    row = ((label + 0.5) * model.pitch - 0.5).astype(np.float32)
+    counts = np.bincount(chains.column[keep], minlength=len(peaks.start) - 1)
+    slope = model.pitch / found.pitch
+    return label, dense.Knots(
+        np.concatenate(([0], np.cumsum(counts))).astype(np.int32),
+        decided.fine.y[keep],
+        row[keep],
+        (decided.fine.sigma[keep] * slope).astype(np.float32),
+        decided.confidence[keep],
+        decided.light[keep],
+        peaks.height[keep],
+        label[keep],
     )
 
 
