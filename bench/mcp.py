@@ -2,9 +2,9 @@
 
     python bench/mcp.py [--scene bust] [--pattern own|published] [--runs 20] [--seconds 20] [--threads 2]
 
-Prints the median CPU time of one thread, ms: of a frame decoded by itself, of one in a series (pitch and carriers are
-known from the frame before) with each stage, and of its XYZ; then the frames a second that so many threads sustain,
-each with a decoder of its own, from image to XYZ.
+Prints the median CPU time of one thread, ms: of a frame decoded by itself to all maps, of one in a series (pitch and
+carriers are known from the frame before) with each stage, of one in a series to rows alone, and of its XYZ; then the
+frames a second that so many threads sustain, each with a decoder of its own, from image to XYZ.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mcp_accuracy import PATTERNS, take
 
 from scanner.decode import decoder_for
 from scanner.decode.mcp import decode_image, warm_up
-from scanner.decode.mcp.decoder import decode_next
+from scanner.decode.mcp.decoder import decode_next, positions_next
 from scanner.triangulation import triangulate
 
 
@@ -37,26 +37,31 @@ def main():
     warm_up()
     frame, sequence, camera, _, calibration = take(f"casey2011/{chosen.scene}", PATTERNS[chosen.pattern])
     known = decode_next(frame, sequence.pattern, sequence.projector, camera, None)[1]
-    alone, series, points, stages = [], [], [], []
+    given = (frame, sequence.pattern, sequence.projector, camera)
+    alone, series, rows, points, stages = [], [], [], [], []
     for _ in range(chosen.runs + 2):
-        begin = time.thread_time()
-        decode_image(frame, sequence.pattern, sequence.projector, camera)
-        alone.append(1e3 * (time.thread_time() - begin))
-        begin = time.thread_time()
-        decoded, known = decode_next(frame, sequence.pattern, sequence.projector, camera, known)
-        series.append(1e3 * (time.thread_time() - begin))
+        timed(alone, lambda: decode_image(*given))
+        decoded, _ = timed(series, lambda: decode_next(*given, known))
         stages.append(decoded.details["stages_ms"])
-        begin = time.thread_time()
-        triangulate(calibration, rows=decoded.rows)
-        points.append(1e3 * (time.thread_time() - begin))
+        found, _ = timed(rows, lambda: positions_next(*given, known))
+        timed(points, lambda: triangulate(calibration, rows=found))  # noqa: B023
     for name in stages[-1]:
         print(f"  {name:16s} {np.median([s[name] for s in stages[2:]]):7.2f} ms")
-    one, next_one, xyz = (float(np.median(times[2:])) for times in (alone, series, points))
+    one, next_one, positions, xyz = (float(np.median(times[2:])) for times in (alone, series, rows, points))
     print(f"{chosen.scene}, {chosen.pattern}, {camera.width} x {camera.height}: by itself {one:.1f} ms a frame,")
-    print(f"  in a series {next_one:.1f} ms, XYZ {xyz:.1f} ms: image to XYZ {next_one + xyz:.1f} ms")
+    print(f"  in a series {next_one:.1f} ms, rows alone {positions:.1f} ms, XYZ {xyz:.1f} ms:")
+    print(f"  image to XYZ {positions + xyz:.1f} ms, with all maps {next_one + xyz:.1f} ms")
     if chosen.seconds:
         rate = sustained(frame, sequence, camera, calibration, chosen.threads, chosen.seconds)
         print(f"  {chosen.threads} threads over {chosen.seconds:g} s: {rate:.1f} frames a second, image to XYZ")
+
+
+def timed(times, work):
+    """What `work` returns; its CPU time, ms, goes to `times`."""
+    begin = time.thread_time()
+    result = work()
+    times.append(1e3 * (time.thread_time() - begin))
+    return result
 
 
 def sustained(frame, sequence, camera, calibration, threads, seconds):
@@ -68,7 +73,7 @@ def sustained(frame, sequence, camera, calibration, threads, seconds):
         decoder = decoder_for(sequence, camera)
         while time.perf_counter() < end:
             decoder.add(0, frame)
-            triangulate(calibration, rows=decoder.finish().rows)
+            triangulate(calibration, rows=decoder.positions())
             decoder.next_frame()
             counts[number] += 1
 
