@@ -24,9 +24,9 @@ GUARD_NS = 100_000
 """Between a pattern's certain light and the pulse, and before the next edge, at least; more where the events of a
 board's pulses are known less well: a tenth of a millisecond costs nothing at any refresh."""
 
-SPARE_PULSES = 1
-"""Pulses after the last: a flip that is late by a refresh still gets its frame, and a camera that dropped one edge and
-took a false one is found out by the count (one more frame than patterns)."""
+PULSES_A_PATTERN = 2
+"""Pulses that the board has for each pattern, so that every flip may be late by a slot and its frame is there all the
+same. The board is stopped once all frames are: those that nobody needed are never given."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class TriggerPlan:
 
     def table(self, patterns: int, dwell: int) -> list[TableSlot]:
         """The board's table for so many patterns, source VSYNC: every `dwell` vertical blanks one pulse."""
-        count = patterns + self.lead + SPARE_PULSES
+        count = PULSES_A_PATTERN * patterns + self.lead
         return [
             TableSlot(image=i, exposure_us=self.pulse_us, dark_us=self.dark_us, wait_trigger=True, edges=dwell)
             for i in range(count)

@@ -71,13 +71,12 @@ class TriggeredRounds:
         guard = guard_ns(None if self._board is None else self._board.capabilities)
         pairing = Pairing(self._plan, line, with_board=self._board is not None, guard=guard)
         try:
-            self._begin(len(patterns), black)
-            hold = (self._plan.dwell - 1) * self._plan.refresh_ns + self._plan.refresh_ns // 2
+            first = self._begin(len(patterns), black)
             for pattern in patterns:
                 check()
                 flip = self._projector.show(pattern % self._plan.patterns)
                 pairing.flipped(pattern, flip)
-                self._collect(pairing, take, flip.t_ns + hold)
+                self._collect(pairing, take, flip.t_ns + self._hold_ns(flip.vblank - first))
             last = self._clock.now_ns()
             lead = 0 if self._plan.trigger is None else self._plan.trigger.lead
             self._collect(pairing, take, last + lead * self._plan.period_ns + self._plan.pop_timeout_ns, whole=True)
@@ -109,11 +108,14 @@ class TriggeredRounds:
                 take(*found)
         return pairing.without_frame()
 
-    def _begin(self, patterns: int, black: int) -> None:
-        """Arm so that the first edge counted is that of the first flip, or nearly: `Pairing` allows for the rest."""
+    def _begin(self, patterns: int, black: int) -> int:
+        """Arm so that the first edge counted is that of the first flip, or nearly: `Pairing` allows for the rest.
+
+        Returns the vertical blank at which the first pattern should be flipped to.
+        """
         flip = self._projector.show(black)
         if self._board is None or self._plan.trigger is None:
-            return
+            return flip.vblank + 1
         self._board.program(self._plan.trigger.table(patterns, self._plan.dwell), TriggerSource.VSYNC)
         refresh = self._plan.refresh_ns
         passed = -(-(self._clock.now_ns() + self._arming_ns - flip.t_ns) // refresh)
@@ -124,6 +126,18 @@ class TriggeredRounds:
         self._arming_ns = self._clock.now_ns() - began
         # The first slot, too, begins at the edge whose number is the dwell.
         self._clock.sleep_until(armed_ns + (self._plan.dwell - 1) * refresh)
+        return flip.vblank + passed + self._plan.dwell
+
+    def _hold_ns(self, since_first: int) -> int:
+        """Time after a flip in which the host may take frames; half a refresh is left for it to be back in time.
+
+        A board pulses every `dwell` refreshes whatever the host does: a pattern that was late by less stays on until
+        the next ones are in step with the pulses again.
+        """
+        dwell = self._plan.dwell
+        late = 0 if self._board is None else since_first % dwell
+        stays = dwell + (dwell - late if late else 0)
+        return (stays - 1) * self._plan.refresh_ns + self._plan.refresh_ns // 2
 
     def _collect(self, pairing: Pairing, take: Take, until_ns: int, *, whole: bool = False) -> None:
         """Take frames until then; `whole`: until every pattern has one."""

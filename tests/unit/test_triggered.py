@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -94,7 +97,7 @@ def test_a_long_exposure_takes_more_refreshes() -> None:
     assert made.dwell == 2
     assert made.trigger is not None
     assert {slot.edges for slot in made.trigger.table(4, made.dwell)} == {2}
-    assert len(made.trigger.table(4, made.dwell)) == 5
+    assert len(made.trigger.table(4, made.dwell)) == 8
 
 
 def test_a_camera_that_is_not_ready_in_time_gets_it() -> None:
@@ -175,7 +178,14 @@ def test_a_believed_stamp_without_a_count_stays_a_belief() -> None:
 # --- runs ---------------------------------------------------------------------------------------------------------
 
 
-def take(faults: str = "", sequence: PatternSequence = SEQUENCE, board: bool = True, **options: Any) -> Taken:
+def take(
+    faults: str = "",
+    sequence: PatternSequence = SEQUENCE,
+    board: bool = True,
+    late: Mapping[int, float] = MappingProxyType({}),
+    **options: Any,
+) -> Taken:
+    """late: by slot, the refreshes that the host was kept from flipping."""
     device = "quick/board?seed=1&min_gap_us=1000" + (f"&{faults}" if faults else "")
     clock = VirtualClock()
     projector, camera = open_projector("simulated", device, {}, clock), open_camera("simulated", device, {}, clock)
@@ -184,7 +194,13 @@ def take(faults: str = "", sequence: PatternSequence = SEQUENCE, board: bool = T
         rig = Rig(projector, camera, trigger, trigger_mode=TriggerMode.HARDWARE)
         sink = MemorySink()
         made = rig.plan(sequence, **{"exposure_ns": 12_500_001, **options})
-        acquisition = acquire(rig, made, sequence, sink, clock)
+        slots = itertools.count()
+
+        def busy() -> bool:
+            clock.sleep_until(clock.now_ns() + round(late.get(next(slots), 0) * REFRESH))
+            return False
+
+        acquisition = acquire(rig, made, sequence, sink, clock, cancelled=busy)
         seen = camera.capabilities
         truth = camera.truth()  # type: ignore[attr-defined]
         return Taken(acquisition, sequence, sink, truth, CameraFormat(seen.width, seen.height, seen.bits))
@@ -204,6 +220,17 @@ def test_a_sequence_takes_as_many_refreshes_as_it_has_images() -> None:
     assert first.flip is not None
     assert last.exposure is not None
     assert last.exposure.end_ns - first.flip.t_ns <= len(SEQUENCE) * REFRESH + 4 * MS
+    assert {verdict.verdict for verdict in taken.acquisition.verdicts} == {"proved"}
+    assert taken.error_px().max() < 1
+
+
+@pytest.mark.parametrize(("refreshes", "dwell"), [(0.75, 1), (1.75, 2), (2.5, 3)])
+def test_a_host_that_flips_late_costs_no_retakes(refreshes: float, dwell: int) -> None:
+    """The board pulses on: late flips take some more of its pulses, and those after them are in step again."""
+    taken = take(late={0: 0.7, 3: 0.7, 4: 0.7, 9: 2.2, 15: 1.3, 22: 0.7}, exposure_ns=round(refreshes * REFRESH))
+    assert taken.acquisition.plan.dwell == dwell
+    assert taken.acquisition.error is None
+    assert taken.acquisition.retakes == 0
     assert {verdict.verdict for verdict in taken.acquisition.verdicts} == {"proved"}
     assert taken.error_px().max() < 1
 
