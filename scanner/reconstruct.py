@@ -18,6 +18,7 @@ from scanner.capture import Capture, CaptureHeader
 from scanner.capture.exposure import exposure_report, exposure_warnings
 from scanner.carrier_check import require_carriers
 from scanner.compare import compare
+from scanner.contrast import widen_at_edges
 from scanner.decode import Decoded, Decoder, Reason, decoder_for
 from scanner.decode.repeated import Repetitions
 from scanner.decode.stages import Observer
@@ -138,6 +139,9 @@ class Reconstruction:
         decoded = self._carriers_fit(self._fits_geometry(decoded), capture)
         tell("triangulating")
         scan = build_scan(decoded, self._calibration, self._options.filters, timings=self._timings)
+        if isinstance(self._header.sequence.pattern, PmpPattern):
+            with self._timed("widen sigmas"):
+                scan = widen_at_edges(scan, "y" if self._calibration is None else self._calibration.phase_axis)
         scan = scan.with_report(sync=check.as_dict(), capture=self._capture_report(capture))
         if self._options.compare_truth:
             tell("comparing with truth")

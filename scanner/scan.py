@@ -321,12 +321,12 @@ def _report(
         },
         "removed": dict(removed),
         "filters": settings.as_dict(),
-        "rows_px": _spread(scan.rows),
-        "columns_px": _spread(scan.columns),
-        "sigma_rows_px": _spread(scan.sigma_rows),
-        "sigma_columns_px": _spread(scan.sigma_columns),
-        "depth_mm": _spread(None if scan.xyz is None else scan.xyz[..., 2]),
-        "sigma_z_mm": _spread(scan.sigma_z),
+        "rows_px": spread(scan.rows),
+        "columns_px": spread(scan.columns),
+        "sigma_rows_px": spread(scan.sigma_rows),
+        "sigma_columns_px": spread(scan.sigma_columns),
+        "depth_mm": spread(None if scan.xyz is None else scan.xyz[..., 2]),
+        "sigma_z_mm": spread(scan.sigma_z),
         "rig": None if calibration is None else _rig(calibration),
         "decoder": dict(decoded.details),
         "warnings": list(decoded.warnings),
@@ -373,7 +373,7 @@ def _rig(calibration: Calibration) -> dict[str, Any]:
     return {"calibration": calibration.id, "projector_centre_mm": calibration.projector_centre.tolist()}
 
 
-def _spread(values: Map | None) -> dict[str, float] | None:
+def spread(values: Map | None) -> dict[str, float] | None:
     """1st, 50th and 99th percentile of a map, from every fourth pixel each way where it is large."""
     if values is None:
         return None
