@@ -2,15 +2,18 @@
 
     python bench/calibration.py poses [--seeds 3] [--rigs casey2011,bench2026] [--targets charuco,chessboard]
     python bench/calibration.py planes [--seeds 1] [--rig casey2011]
+    python bench/calibration.py sphere [--seeds 1] [--rig casey2011]
     python bench/calibration.py wedge [--seeds 1] [--rig casey2011]
     python bench/calibration.py real FOLDER            (corners.npz and capture.json of issue 4's real data)
 
 `poses`: the 12 simulated poses of scenes.json, both axes, (1, 8, 64) x 8; for each rig and target the median over
 seeds of the largest error of the four focal lengths (%), of the four principal coordinates (px), of the translation's
 length of error (mm), and the share of those eleven numbers within two stated sigmas. Target's length stated to 0.01 mm.
-`planes`: rigs calibrated so measure boards at -30, 0 and 30 degrees, by PMP and by MCP: flatness (worst of 9 places on
-each of 3 boards, near, middle and far: rms from the best plane), shape (rms after a rigid fit of a whole board to
-truth), position (rms against truth); inside, 7 px from edges.
+`planes`: rigs calibrated so measure boards at three depths (100 mm nearer, at the aim, 70 mm farther: the range of the
+poses), and tilted by 30 degrees both ways, by PMP and by MCP: flatness (worst of 9 places of a board: rms from the best
+plane), shape (rms after a rigid fit of a whole board to truth), position (rms against truth); inside, 7 px from edges.
+`sphere`: such rigs measure the ball before the board: radius less the true one; form as rms of the radial distances,
+and as the spread of 997 of 1000 of them (PF of VDI/VDE 2634-2), which is six times the noise.
 `wedge`: the dissertation's own procedure, the wedge with 18 discs and the Hall model, then the board in rows: rms in
 depth in the wedge's frame, with and without the discs' correction for perspective.
 """
@@ -24,6 +27,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from drivers.registry import open_camera, open_projector
@@ -37,6 +41,7 @@ from scanner.calibration.problem import View
 from scanner.calibration.solve import SolveOptions, sigmas, solve
 from scanner.calibration.solve_hall import solve_hall
 from scanner.calibration.targets import parse_target
+from scanner.calibration.verification import sphere
 from scanner.clock import VirtualClock
 from scanner.decode import decoder_for
 from scanner.devices import CameraSettings, TriggerMode
@@ -127,20 +132,46 @@ def poses(chosen):
             )
 
 
+BOARDS = ((0, -100), (0, 0), (0, 70), (-30, 0), (30, 0))
+"""Tilt, degrees, and offset in depth, mm of casey2011"""
+
+
 def planes(chosen):
-    print("method  board   flatness mm (worst of 9)   shape mm   position mm")
+    print("method  tilt  offset   flatness mm (worst of 9)   shape mm   position mm")
     for seed in range(chosen.first, chosen.first + chosen.seeds):
         solution, true, _ = calibrated(chosen.rig, chosen.target, seed)
         rig = solution.geometry
         axis = true.phase_axis
         for method in ("pmp", "mcp"):
-            for degrees in (-30, 0, 30):
+            for degrees, offset in BOARDS:
                 pattern = PmpPattern(axes=(axis,)) if method == "pmp" else McpPattern(axis=axis)
-                device = f"{chosen.rig}/tilt?tilt_deg={degrees}&about={'y' if axis == 'y' else 'x'}&seed={seed}"
+                about = "y" if axis == "y" else "x"
+                device = f"{chosen.rig}/tilt?tilt_deg={degrees}&about={about}&offset_mm={offset}&seed={seed}"
                 decoded, truth, _ = take(device, pattern)
                 xyz = triangulate(rig, rows=decoded.rows, columns=decoded.columns).xyz
                 figures = _plane_figures(xyz, truth)
-                print(f"{method:6} {degrees:6} {figures[0]:12.4f} {figures[1]:22.4f} {figures[2]:12.4f}", flush=True)
+                print(
+                    f"{method:6} {degrees:5} {offset:7} {figures[0]:12.4f} {figures[1]:22.4f} {figures[2]:12.4f}",
+                    flush=True,
+                )
+
+
+def spheres(chosen):
+    radius = reference()["scenes"]["sphere_board"]["radius_mm"] * simulated_rig(chosen.rig).scale
+    print("calibration   radius error mm   form mm (rms)   form mm (PF, 99.7 %)   points")
+    for seed in range(chosen.first, chosen.first + chosen.seeds):
+        solution, true, _ = calibrated(chosen.rig, chosen.target, seed)
+        pattern = PmpPattern(axes=(true.phase_axis,), frequencies=(1.0, 8.0, 64.0), shifts=(8, 8, 8))
+        decoded, truth, _ = take(f"{chosen.rig}/sphere_board?seed={seed}", pattern)
+        inside = cv2.erode(truth.lit.astype(np.uint8), np.ones((15, 15), np.uint8)).astype(bool)
+        for name, rig in (("own", solution.geometry), ("true", true)):
+            xyz = triangulate(rig, rows=decoded.rows, columns=decoded.columns).xyz
+            xyz[~inside] = np.nan
+            found = sphere(xyz, 2 * radius)
+            print(
+                f"{name:11} {found.size_mm / 2:+17.4f} {found.rms_mm:15.4f} {found.form_mm:22.4f} {found.points:8}",
+                flush=True,
+            )
 
 
 def _plane_figures(xyz, truth):
@@ -252,7 +283,7 @@ def real(chosen):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    for name, work in (("poses", poses), ("planes", planes), ("wedge", wedge), ("real", real)):
+    for name, work in (("poses", poses), ("planes", planes), ("sphere", spheres), ("wedge", wedge), ("real", real)):
         command = commands.add_parser(name)
         command.set_defaults(work=work)
         command.add_argument("--seeds", type=int, default=3 if name == "poses" else 1)

@@ -41,10 +41,12 @@ class Scene:
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """What a scene can be asked: tilt of `tilt`, the number of a printed target's pose."""
+    """What a scene can be asked: tilt and place of `tilt`, the number of a printed target's pose."""
 
     tilt_deg: float = field(default=30.0, metadata={"low": -60.0, "high": 60.0})
     about: str = field(default="x", metadata={"choices": ("x", "y")})
+    offset_mm: float = field(default=0.0, metadata={"low": -400.0, "high": 400.0})
+    """of the board of `tilt`: farther than the aim by this, in the scene's mm (casey2011's)"""
     pose: int = field(default=0, metadata={"low": 0, "high": 11})
 
 
@@ -69,7 +71,7 @@ def build_scene(name: str, options: SceneOptions, rig: Rig, seed: int) -> Scene:
         about, degrees = _TILTS[name]
         return _tilt(degrees, about)
     if name == "tilt":
-        return _tilt(options.tilt_deg, options.about)
+        return _tilt(options.tilt_deg, options.about, options.offset_mm)
     if name in targets.POSED:
         return _posed(name, options.pose, rig, seed)
     return _SCENES[name]()
@@ -92,11 +94,11 @@ def _board() -> Scene:
     return Scene(_plane(REFERENCE_AIM_MM)[None], (Material(_albedo()),))
 
 
-def _tilt(degrees: float, about: str) -> Scene:
+def _tilt(degrees: float, about: str, offset_mm: float = 0.0) -> Scene:
     angle = np.radians(degrees)
     u = X if about == "x" else np.cos(angle) * X + np.sin(angle) * Z
     v = np.cos(angle) * Y + np.sin(angle) * Z if about == "x" else Y
-    return Scene(rectangle(TARGET, u, v)[None], (Material(_albedo()),))
+    return Scene(rectangle(TARGET + offset_mm * Z, u, v)[None], (Material(_albedo()),))
 
 
 def _textured() -> Scene:
