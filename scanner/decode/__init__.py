@@ -97,7 +97,7 @@ class PositionsDecoder(Decoder, Protocol):
     """A decoder that can give rows or columns alone, in less time: for those who use no other map."""
 
     def positions(self) -> Map:
-        """In place of `finish`: its rows, or its columns where the pattern's axis is "x".
+        """In place of `finish`: its rows, or its columns where the pattern's axis is "x"; until the next call.
 
         Raises:
             DecodeError: as `finish`.

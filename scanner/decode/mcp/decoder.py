@@ -14,7 +14,7 @@ from scanner.decode.frames import FrameCheck
 from scanner.decode.mcp.decision import Decision, decide
 from scanner.decode.mcp.door import grey, turned, turned_back, upright_image, upside_down
 from scanner.decode.mcp.locate import Array, Found, Image, Known, Stages, locate
-from scanner.decode.mcp.maps import maps_of, rows_of
+from scanner.decode.mcp.maps import fill_rows, maps_of
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.white import RATIO_BITS, divided, in_grey_levels
 from scanner.errors import DecodeError
@@ -76,14 +76,20 @@ def positions_next(
     projector: ProjectorSize,
     camera: CameraFormat,
     known: Known | None,
+    memory: Array | None = None,
 ) -> tuple[Array, Known]:
     """`decode_next` for those who want rows (axis "x": columns) and no other map: (H, W) float32, NaN where undecided.
+
+    Args:
+        image, pattern, projector, camera, known: as for `decode_next`.
+        memory: float32, as large as the image, for the result to be in: fresh memory takes longer than what is written.
 
     Raises:
         DecodeError: as `decode_image`.
     """
     seen, learnt = _see(image, pattern, projector, camera, known)
-    rows = rows_of(seen.image, seen.found, seen.decided, seen.model)
+    rows = (np.empty(image.size, np.float32) if memory is None else memory).reshape(seen.image.shape)
+    fill_rows(seen.found, seen.decided, seen.model, rows)
     rows = np.ascontiguousarray(rows[::-1]) if seen.upside_down else rows
     return rows if pattern.axis == "y" else turned(rows), learnt
 
@@ -190,6 +196,7 @@ class McpDecoder:
         self._pattern = sequence.pattern
         self._camera = camera
         self._known: Known | None = None
+        self._memory = np.empty(0, np.float32)
         self.next_frame()
 
     def next_frame(self) -> None:
@@ -229,7 +236,10 @@ class McpDecoder:
         """Rows or columns alone; see `scanner.decode.PositionsDecoder`."""
         known, self._known = self._known, None
         image, camera = self._to_decode()
-        rows, self._known = positions_next(image, self._pattern, self._sequence.projector, camera, known)
+        if self._memory.size != image.size:
+            self._memory = np.empty(image.size, np.float32)
+        size = self._sequence.projector
+        rows, self._known = positions_next(image, self._pattern, size, camera, known, self._memory)
         return rows
 
     def _to_decode(self) -> tuple[NDArray[Any], CameraFormat]:

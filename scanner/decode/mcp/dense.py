@@ -75,11 +75,9 @@ def interpolate(knots: Knots, shape: tuple[int, int], pitch: float, step: float)
     return Maps(*wide)
 
 
-def rows_alone(knots: Knots, shape: tuple[int, int], pitch: float, step: float) -> Array:
-    """`interpolate`'s rows without the other maps, in a third of the time: (H, W) float32."""
-    wide = np.empty((1, *shape), np.float32)
-    _interpolate(knots, pitch, step, wide)
-    return np.asarray(wide[0])
+def rows_alone(knots: Knots, pitch: float, step: float, rows: Array) -> None:
+    """`interpolate`'s rows without the other maps, in a third of the time, into `rows`: (H, W) float32."""
+    _interpolate(knots, pitch, step, rows[None])
 
 
 def _interpolate(knots: Knots, pitch: float, step: float, wide: Array) -> None:

@@ -49,10 +49,12 @@ def _events(column: Ints, begin: Ints, end: Ints, size: int) -> tuple[Ints, Ints
     none.
     """
     count = len(column)
+    alone = np.empty(count, np.bool_)  # nothing of its column follows it at once
     first = np.zeros(size + 2, np.int32)
     for n in range(count):
+        alone[n] = n + 1 == count or column[n + 1] != column[n] or begin[n + 1] != end[n]
         first[begin[n] + 1] += 1
-        if _is_last(column, begin, end, n):
+        if alone[n]:
             first[end[n] + 1] += 1
     for y in range(size + 1):
         first[y + 1] += first[y]
@@ -62,17 +64,11 @@ def _events(column: Ints, begin: Ints, end: Ints, size: int) -> tuple[Ints, Ints
         e = place[begin[n]]
         place[begin[n]] += 1
         of_column[e], which[e] = column[n], n
-        if _is_last(column, begin, end, n):
+        if alone[n]:
             e = place[end[n]]
             place[end[n]] += 1
             of_column[e], which[e] = column[n], count
     return first, of_column, which
-
-
-@kernel
-def _is_last(column: Ints, begin: Ints, end: Ints, n: int) -> bool:
-    """Whether nothing of its column follows a piece at once."""
-    return bool(n + 1 == len(column) or column[n + 1] != column[n] or begin[n + 1] != end[n])
 
 
 @kernel

@@ -54,10 +54,10 @@ def maps_of(image: Image, found: Found, decided: Decision, model: PatternModel, 
     )
 
 
-def rows_of(image: Image, found: Found, decided: Decision, model: PatternModel) -> Array:
-    """`maps_of`'s rows alone: (H, W) float32, NaN where undecided."""
+def fill_rows(found: Found, decided: Decision, model: PatternModel, rows: Array) -> None:
+    """`maps_of`'s rows alone, into `rows`: (H, W) float32, NaN where undecided."""
     _, knots = _knots(found, decided, model)
-    return dense.rows_alone(knots, (image.shape[0], image.shape[1]), found.pitch, model.pitch)
+    dense.rows_alone(knots, found.pitch, model.pitch, rows)
 
 
 def _knots(found: Found, decided: Decision, model: PatternModel) -> tuple[NDArray[np.int32], dense.Knots]:
