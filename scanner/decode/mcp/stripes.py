@@ -42,8 +42,9 @@ APART = 15
 HEIGHT_FLOOR = 0.04
 """Stripes lower than this share of the 99th percentile are left out: what lies outside the object (mcp.md, sec. 3)."""
 
-BORDER = 0.15
-"""Pitches from the image's border within which a peak counts as cut: less than a third of its flank is there."""
+BORDER = 2
+"""Samples to either side of a peak without which it counts as cut by the image's border: one to fit, and one more for
+the slope there."""
 
 LEAST_FLANK = 0.45
 """Least ratio of a stripe's two flanks: below it one is cut off by an edge of the object."""
@@ -170,10 +171,7 @@ def find_peaks(reduced: Array, pitch: float, carrier_px: float, noise: float, we
         weakest: mean light of the pattern's dimmest stripe over that of its brightest.
     """
     sigma_x, sigma_y = 0.3 * carrier_px / STEP, pitch / 12
-    smooth = np.asarray(
-        cv2.GaussianBlur(reduced, (0, 0), sigmaX=sigma_y, sigmaY=sigma_x, borderType=cv2.BORDER_REFLECT_101),
-        np.float32,
-    )
+    smooth = _smoothed(reduced, sigma_x, sigma_y)
     # A Gaussian of sigma a, b leaves 1 / sqrt(4 pi a b) of white noise.
     left = noise / np.sqrt(max(1.0, 4 * np.pi * sigma_x * sigma_y))
     table = _peaks_of(smooth, np.float32(5 * left + 1e-3), np.float32(pitch))
@@ -195,6 +193,22 @@ def find_peaks(reduced: Array, pitch: float, carrier_px: float, noise: float, we
     counts = np.add.reduceat(np.append(keep, False).astype(np.int32), np.minimum(start[:-1], len(keep)))
     counts[start[:-1] == start[1:]] = 0
     return _as_peaks(np.concatenate(([0], np.cumsum(counts))).astype(np.int32), rows[keep])
+
+
+def _smoothed(reduced: Array, sigma_x: float, sigma_y: float) -> Array:
+    """Gaussian means of the columns. Beyond a column's ends the flank that the border cuts goes on: mirrored, a peak
+    near the end would run into its own image.
+    """
+    sides: dict[str, Any] = {"sigmaX": sigma_y, "sigmaY": sigma_x, "borderType": cv2.BORDER_REFLECT_101}
+    smooth = np.asarray(cv2.GaussianBlur(reduced, (0, 0), **sides), np.float32)
+    reach = int(np.ceil(3 * sigma_y))
+    if reduced.shape[1] > 4 * reach:
+        for lines, out in ((reduced, smooth), (reduced[:, ::-1], smooth[:, ::-1])):
+            slope = (lines[:, :1] - lines[:, 2:3]) / 2
+            beyond = lines[:, :1] + slope * np.arange(reach, 0, -1, dtype=np.float32)
+            strip = np.ascontiguousarray(np.concatenate((beyond, lines[:, : 2 * reach]), axis=1))
+            out[:, :reach] = cv2.GaussianBlur(strip, (0, 0), **sides)[:, reach : 2 * reach]
+    return smooth
 
 
 def spacing(peaks: Peaks) -> float:
@@ -243,18 +257,21 @@ def _turning_points(line: Array, delta: np.float32, tops: NDArray[np.int32], low
 def _describe(line: Array, top: int, above: int, below: int, pitch: np.float32, row: Array) -> None:
     """The six figures of `Peaks` for one maximum."""
     size = len(line)
-    left, right = line[top] - line[above], line[top] - line[below]
-    valley = line[above] + (line[below] - line[above]) * (top - above) / max(below - above, 1)
+    # A flank that the border cuts says nothing of its height: the other one stands for both.
+    half = np.float32(0.5) * pitch
+    if top < half:
+        low, high, above = line[below], line[below], 2 * top - below
+    elif size - 1 - top < half:
+        low, high, below = line[above], line[above], 2 * top - above
+    else:
+        low, high = line[above], line[below]
+    left, right = line[top] - low, line[top] - high
+    valley = low + (high - low) * (top - above) / max(below - above, 1)
     curve = line[top - 1] - 2 * line[top] + line[top + 1]
     row[0] = top
     if curve < 0:
         row[0] += np.float32(0.5) * (line[top - 1] - line[top + 1]) / curve
-    # A flank that the border cuts says nothing of its height.
-    half = np.float32(0.5) * pitch
-    left = right if top < half else left
-    right = left if size - 1 - top < half else right
-    reach = np.float32(BORDER) * pitch
-    inside = top >= reach and top <= size - 1 - reach
+    inside = BORDER <= top <= size - 1 - BORDER
     row[1] = line[top] - valley
     row[2] = valley
     row[3] = above

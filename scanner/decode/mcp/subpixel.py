@@ -35,6 +35,11 @@ ROUGH = np.float32(0.1)
 """Residual of the odd part, as a share of the stripe's height, above which it is no whole stripe: a triangle cut off at
 a third of its flank leaves as much."""
 
+FEW = 4
+SMOOTH = np.float32(0.01)
+"""A fit to fewer samples, at the image's border, leaves no residual worth the name: such a share of the height is taken
+for it, what whole stripes leave."""
+
 MOST_BEND = 0.3
 """Change of the pitch from one stripe to the next, in pitches, above which there is a step of depth between them."""
 
@@ -139,7 +144,7 @@ def _straighten(reduced: Array, b: int, centre: np.float32, p: int, profile: Arr
 def _room(size: int, g: np.float32, above: np.float32, below: np.float32, reach: int) -> int:
     """Samples to either side of a peak: within the image, and short of the neighbours' flanks where foreshortened."""
     near = np.float32(0.9) * min(g - above, below - g)
-    return int(min(np.float32(reach), g - 1, size - 3 - g, near))
+    return int(min(np.float32(reach), g, size - 1 - g, near))
 
 
 @summing_kernel
@@ -253,7 +258,7 @@ def _refine(
             worth[p] = determinant / ss if apart else np.float32(0)
         for p in range(count):
             ss, sv, vv, os, ov, oo = sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3], sums[p, 4], sums[p, 5]
-            if used[p] < 3 or ss <= 0:
+            if used[p] < 2 or ss <= 0:
                 continue
             k = runs[first + p]
             slope = _slope_at(p, count, kappa, worth)
@@ -262,6 +267,8 @@ def _refine(
                 oo - 2 * shift * os - 2 * slope * ov + shift * shift * ss + 2 * shift * slope * sv + slope * slope * vv
             )
             rough = np.sqrt(max(left, np.float32(0)) / np.float32(max(used[p] - 2, 1)))
+            if used[p] < FEW:
+                rough = max(rough, SMOOTH * height[k])
             sigma[k] = ALIKE * rough / np.sqrt(ss) + SIGMA_FLOOR
             y[k] = guess[k] + shift
             far = abs(shift) > np.float32(0.35) * np.float32(reach)
