@@ -30,6 +30,7 @@ from scanner.patterns import McpPattern, PatternSequence, PmpPattern
 from scanner.scale_check import require_codes_within, require_geometry
 from scanner.scan import Scan, build_scan
 from scanner.sequencer import check_capture
+from scanner.uncertainty import budget_of
 
 TRUTH_FILE = "truth.npz"
 
@@ -142,7 +143,11 @@ class Reconstruction:
         if isinstance(self._header.sequence.pattern, PmpPattern):
             with self._timed("widen sigmas"):
                 scan = widen_at_edges(scan, "y" if self._calibration is None else self._calibration.phase_axis)
-        scan = scan.with_report(sync=check.as_dict(), capture=self._capture_report(capture))
+        scan = scan.with_report(
+            sync=check.as_dict(),
+            capture=self._capture_report(capture),
+            uncertainty=self._budget(scan, check.mixed_share),
+        )
         if self._options.compare_truth:
             tell("comparing with truth")
             scan = self._compared(scan, capture)
@@ -180,6 +185,13 @@ class Reconstruction:
             return decoded
         with self._timed("check geometry"):
             return require_geometry(decoded, self._calibration, self._header.sequence)
+
+    def _budget(self, scan: Scan, mixed: float | None) -> dict[str, Any] | None:
+        if self._calibration is None:
+            return None
+        with self._timed("uncertainty"):
+            found = budget_of(scan, self._calibration, self._header.sequence, mixed, self._repetitions.count)
+        return None if found is None else found.as_dict()
 
     def _carriers_fit(self, decoded: Decoded, capture: Capture) -> Decoded:
         """MCP on a calibrated rig: the carriers' frequencies agree with the stripes' names; see `carrier_check`."""

@@ -13,7 +13,7 @@ from scanner.sequencer.disorder import RECORDED_HINT, sync_error
 from scanner.sequencer.findings import Witnesses
 from scanner.sequencer.plan import Plan
 from scanner.sequencer.thumbnail import thumbnail
-from scanner.sequencer.verify import FrameVerdict, summary, verify
+from scanner.sequencer.verify import FrameVerdict, mixed_share, summary, verify
 from scanner.sequencer.witness import witness
 
 
@@ -43,6 +43,13 @@ class CaptureCheck:
     def summary(self) -> Mapping[str, int]:
         """Number of frames by verdict."""
         return summary(self.verdicts)
+
+    @property
+    def mixed_share(self) -> float | None:
+        """Largest share of an exposure that may have seen another pattern; None where no stamps can tell."""
+        if self.plan is None or not self.capture.all_records:
+            return None
+        return mixed_share(self.plan, self.capture.all_records)
 
     def raise_if_out_of_step(self) -> CaptureCheck:
         """Raise if anything speaks against the frames; else return self.

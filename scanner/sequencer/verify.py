@@ -96,6 +96,27 @@ def judge(plan: Plan, record: FrameRecord, next_flip: Flip | None) -> FrameVerdi
     return FrameVerdict(record.pattern, verdict, (*outside, *partial, *certain, *believed), suspect)
 
 
+def mixed_share(plan: Plan, records: Sequence[FrameRecord]) -> float | None:
+    """Largest share of an exposure in which another pattern may have shone, bounds included; 0 where all are inside.
+
+    Returns:
+        None where a frame has no stamps, or latency and settling were not measured.
+    """
+    last = {record.pattern: record for record in records if record.pattern < plan.frame_count}
+    flips = _flips(records)
+    times = [flip.t_ns for flip in flips]
+    share = 0.0
+    for record in last.values():
+        exposure, flip = record.exposure, record.flip
+        if record.status != "ok":
+            continue
+        if exposure is None or flip is None or not plan.measured:
+            return None
+        early, late = _excess(plan, exposure, flip, _next(flips, times, flip))
+        share = max(share, (max(early, 0) + max(late, 0)) / max(exposure.end_ns - exposure.start_ns, 1))
+    return share
+
+
 def summary(verdicts: Sequence[FrameVerdict]) -> Mapping[str, int]:
     """Number of frames by verdict."""
     counts = Counter(verdict.verdict for verdict in verdicts)
@@ -117,16 +138,22 @@ def _belief(plan: Plan, exposure: Exposure, flip: Flip) -> list[str]:
 def _outside(plan: Plan, exposure: Exposure, flip: Flip, next_flip: Flip | None) -> list[str]:
     """(a): where the exposure, with bounds, leaves the pattern's time."""
     reasons = []
-    ready = flip.t_ns + flip.bound_ns + plan.window_start_ns
-    early = ready - (exposure.start_ns - exposure.bound_ns)
+    early, late = _excess(plan, exposure, flip, next_flip)
     if early > 0:
         reasons.append(f"began {_ms(early)} before its pattern certainly shone (bounds included)")
-    if next_flip is not None:
-        gone = next_flip.t_ns - next_flip.bound_ns + plan.window_end_ns
-        late = exposure.end_ns + exposure.bound_ns - gone
-        if late > 0:
-            reasons.append(f"ended {_ms(late)} after the next pattern may have begun (bounds included)")
+    if late > 0:
+        reasons.append(f"ended {_ms(late)} after the next pattern may have begun (bounds included)")
     return reasons
+
+
+def _excess(plan: Plan, exposure: Exposure, flip: Flip, next_flip: Flip | None) -> tuple[int, int]:
+    """By how much an exposure, with bounds, begins before its pattern and ends after it, ns; negative inside."""
+    ready = flip.t_ns + flip.bound_ns + plan.window_start_ns
+    early = ready - (exposure.start_ns - exposure.bound_ns)
+    if next_flip is None:
+        return early, -1
+    gone = next_flip.t_ns - next_flip.bound_ns + plan.window_end_ns
+    return early, exposure.end_ns + exposure.bound_ns - gone
 
 
 def _certainly_outside(plan: Plan, exposure: Exposure, flip: Flip, next_flip: Flip | None) -> list[str]:

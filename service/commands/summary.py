@@ -54,6 +54,8 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     spread = report.get("depth_mm") or {}
     if (near := spread.get("p1")) is not None and (far := spread.get("p99")) is not None:
         facts.append(("depth", f"{near:.1f} .. {far:.1f} mm (1st to 99th percentile)"))
+    if (stated := _uncertainty(report.get("uncertainty") or {})) is not None:
+        facts.append(stated)
     if removed := {name: count for name, count in (report.get("removed") or {}).items() if count}:
         facts.append(("filtered", ", ".join(f"{count:,} {name}" for name, count in removed.items())))
     truth = report.get("truth") or {}
@@ -67,3 +69,15 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         more = f"; {everywhere:,} with those at edges" if everywhere not in (None, wrong) else ""
         facts.append(("wrong", f"{wrong:,} points on a wrong fringe or stripe{more}"))
     return facts
+
+
+def _uncertainty(budget: Mapping[str, Any]) -> tuple[str, str] | None:
+    """One line of the budget: what a point's depth is good to, and what is not in that."""
+    if not budget or budget.get("expanded_mm") is None:
+        return None
+    unknown = ", ".join(budget.get("unknown") or ())
+    text = (
+        f"+-{budget['expanded_mm']:.3f} mm at {budget['depth_mm']:.0f} mm, of 95 in 100 points: "
+        f"{budget['random_mm']:.3f} mm random and {budget['systematic_mm']:.3f} mm systematic (1 sigma)"
+    )
+    return "uncertainty", f"{text}{f'; unknown, and not in it: {unknown}' if unknown else ''}"

@@ -32,6 +32,13 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
         "points": 9,
         "coverage": {"lit": 0.99, "points_of_lit": 0.2},
         "depth_mm": {"p1": 1.0, "p99": 2.0},
+        "uncertainty": {
+            "expanded_mm": 0.144,
+            "depth_mm": 700.2,
+            "random_mm": 0.07,
+            "systematic_mm": 0.0169,
+            "unknown": ["calibration"],
+        },
         "truth": {"inside_px": 7, "inside": {"depth_mm": depth, "wrong": 0}, "lit": {"wrong": 12}},
     }
     (tmp_path / "report.json").write_text(json.dumps(report), encoding="utf-8")
@@ -39,4 +46,7 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
     printed = capsys.readouterr().out
     assert "99.0% of lit pixels, 20.0% keep a point" in printed
     assert "(7 px and more from edges)" in printed
+    assert "+-0.144 mm at 700 mm" in printed
+    assert "0.070 mm random and 0.017 mm systematic" in printed
+    assert "unknown, and not in it: calibration" in printed
     assert "0 points on a wrong fringe or stripe; 12 with those at edges" in printed

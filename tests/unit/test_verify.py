@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scanner.capture import FrameRecord
 from scanner.devices import Exposure, Flip, Source
 from scanner.sequencer import Plan, plan, verify
-from scanner.sequencer.verify import judge, summary
+from scanner.sequencer.verify import judge, mixed_share, summary
 from tests.unit.test_plan import CAMERA, MCP, PMP, PROJECTOR
 
 PLAN = plan(PROJECTOR, CAMERA, PMP, exposure_ns=4_166_667)
@@ -62,6 +62,18 @@ def test_an_exposure_that_ends_when_the_next_pattern_may_begin_is_suspect() -> N
     verdict = verify(PLAN, PMP, records)[4]
     assert verdict.suspect
     assert "after the next pattern may have begun" in verdict.reasons[0]
+
+
+def test_the_share_of_another_patterns_light_is_bounded() -> None:
+    records = sound()
+    assert mixed_share(PLAN, records) == 0
+    last_end = SLOT_NS + 4_000_000 - 1000
+    records[4] = moved(records[4], last_end - 5_000_000 - PLAN.exposure_ns + PLAN.exposure_ns // 10)
+    assert mixed_share(PLAN, records) == pytest.approx(0.1, abs=1e-6)
+    records[5] = replace(records[5], exposure=None)
+    assert mixed_share(PLAN, records) is None
+    unmeasured = plan(replace(PROJECTOR, latency=None), CAMERA, PMP, exposure_ns=4_166_667)
+    assert mixed_share(unmeasured, sound(unmeasured)) is None
 
 
 def test_flips_of_missing_and_repeated_frames_end_a_patterns_time() -> None:

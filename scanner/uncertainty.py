@@ -1,0 +1,199 @@
+"""The uncertainty of a scan as a budget: what each cause adds to depth, in the manner of the GUM (JCGM 100:2008).
+
+Contributions are standard uncertainties at the scan's median depth, random or systematic. Random ones differ from point
+to point and get smaller when a sequence is repeated; systematic ones are common to many points and stay. What cannot be
+told is named as unknown, and is in no sum. The sigmas of single points are the decoder's; this file makes no map.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.calibration_spread import depth_spread
+from scanner.decode.pmp_frames import design_matrix
+from scanner.geometry import Calibration
+from scanner.patterns import Axis, PatternSequence, PmpPattern
+from scanner.scan import Scan
+
+COVERAGE_FACTOR = 2.0
+"""Of the expanded uncertainty: 95 % of a normal error."""
+
+Kind = Literal["random", "systematic"]
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """One cause. px: projector pixels, where it has any; mm: of depth. None: unknown."""
+
+    name: str
+    kind: Kind
+    px: float | None
+    mm: float | None
+    says: str
+    """what it rests on, or why it is unknown"""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """All causes, at one depth."""
+
+    depth_mm: float
+    contributions: tuple[Contribution, ...]
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Names of those that no sum contains."""
+        return tuple(c.name for c in self.contributions if c.mm is None)
+
+    def of(self, kind: Kind) -> float:
+        """Root sum of squares of the known ones of a kind, mm."""
+        return math.sqrt(sum(c.mm**2 for c in self.contributions if c.kind == kind and c.mm is not None))
+
+    @property
+    def combined_mm(self) -> float:
+        """Of all known ones."""
+        return math.hypot(self.of("random"), self.of("systematic"))
+
+    def as_dict(self) -> dict[str, Any]:
+        """For report.json."""
+        return {
+            "depth_mm": self.depth_mm,
+            "contributions": [asdict(c) for c in self.contributions],
+            "random_mm": self.of("random"),
+            "systematic_mm": self.of("systematic"),
+            "combined_mm": self.combined_mm,
+            "expanded_mm": COVERAGE_FACTOR * self.combined_mm,
+            "coverage_factor": COVERAGE_FACTOR,
+            "unknown": list(self.unknown),
+        }
+
+
+def budget_of(
+    scan: Scan, calibration: Calibration, sequence: PatternSequence, mixed: float | None, repeat: int = 1
+) -> Budget | None:
+    """The budget of a scan.
+
+    Args:
+        mixed: largest share of a frame's exposure that another pattern may have shone in, as far as time stamps tell;
+            None where they tell nothing.
+        repeat: how often the sequence was captured.
+
+    Returns:
+        None for a scan without points or without sigmas.
+    """
+    axis: Axis = "y" if scan.columns is None or (scan.rows is not None and calibration.phase_axis == "y") else "x"
+    sigma_px = scan.sigma_rows if axis == "y" else scan.sigma_columns
+    if scan.xyz is None or scan.sigma_z is None or sigma_px is None:
+        return None
+    some = scan.xyz[::4, ::4] if scan.xyz.size > 300_000 else scan.xyz
+    depth, px, mm = some[..., 2], _like(sigma_px, some), _like(scan.sigma_z, some)
+    known = np.isfinite(depth) & np.isfinite(mm) & (px > 0)
+    if not known.any():
+        return None
+    noise_px, noise_mm = float(np.median(px[known])), float(np.median(mm[known]))
+    per_px = float(np.median(mm[known] / px[known]))
+    of_repeats = f", mean of {repeat} repetitions" if repeat > 1 else ""
+    noise = Contribution("noise", "random", noise_px, noise_mm, f"median of the points' sigmas{of_repeats}")
+    light = [_response(scan, sequence, axis), _grey_levels(sequence, axis)] if _is_pmp(sequence) else []
+    causes = (noise, *light, _sync(sequence, mixed, axis))
+    contributions = [_in_mm(cause, per_px) for cause in causes]
+    contributions.insert(1, _calibration(scan, calibration, axis))
+    return Budget(float(np.median(depth[known])), tuple(contributions))
+
+
+def _like(values: Any, some: Any) -> Any:
+    return values if values.shape == some.shape[:2] else values[::4, ::4]
+
+
+def _is_pmp(sequence: PatternSequence) -> bool:
+    return isinstance(sequence.pattern, PmpPattern)
+
+
+def _in_mm(cause: Contribution, per_px: float) -> Contribution:
+    if cause.mm is not None or cause.px is None:
+        return cause
+    return Contribution(cause.name, cause.kind, cause.px, cause.px * per_px, cause.says)
+
+
+def _calibration(scan: Scan, calibration: Calibration, axis: Axis) -> Contribution:
+    spread = depth_spread(calibration, scan, axis)
+    scale = calibration.extra.get("scale")
+    if spread is None:
+        return Contribution("calibration", "systematic", None, None, "the calibration has no covariance")
+    unverified = "; its absolute scale is unverified" if scale == "unverified" else ""
+    return Contribution("calibration", "systematic", None, spread, f"covariance of the calibration{unverified}")
+
+
+def _response(scan: Scan, sequence: PatternSequence, axis: Axis) -> Contribution:
+    """What the frequencies of the scan contradict one another by, beyond noise."""
+    decoder = scan.report.get("decoder") or {}
+    ripple = ((decoder.get("unwrapping") or {}).get(axis) or {}).get("ripple")
+    harmonics: Sequence[Mapping[str, Any]] = ((decoder.get("light") or {}).get(axis) or {}).get("harmonics") or ()
+    finest = max(harmonics, key=lambda h: float(h["frequency"]), default=None)
+    found = [float(ripple["px"])] if ripple else []
+    if finest is not None and finest.get("ripple_px") is not None:
+        found.append(float(finest["ripple_px"]))
+    if not found:
+        return Contribution("response", "systematic", None, None, "one frequency has nothing to contradict it")
+    says = "rms by which frequencies differ beyond noise: harmonics that pass for the fringe, light among surfaces"
+    return Contribution("response", "systematic", max(found), None, says)
+
+
+def _grey_levels(sequence: PatternSequence, axis: Axis) -> Contribution:
+    """What whole grey levels of the projected images shift the finest phase by: its own images, decoded."""
+    px = grey_level_px(sequence, axis)
+    return Contribution("grey levels", "systematic", px, None, "rounding of the projected images to 8 bits, unblurred")
+
+
+def grey_level_px(sequence: PatternSequence, axis: Axis) -> float:
+    """Rms error of the coordinate that a perfect camera would read of the finest set's images, projector px."""
+    pattern = sequence.pattern
+    if not isinstance(pattern, PmpPattern):
+        raise TypeError("grey levels of fringes")
+    finest = max((s for s in pattern.sets() if s.axis == axis), key=lambda s: s.frequency)
+    along = sequence.projector.along(axis)
+    lines = [_line(pattern.fringe(finest.first + n, sequence.projector), axis) for n in range(finest.shifts)]
+    meant: NDArray[np.float32] = np.stack(lines).astype(np.float32)
+    correction = sequence.precorrection
+    if correction is None:
+        shown = np.rint(meant * 255) / 255
+    else:
+        # The light of each input value, where the correction is right: its inverse, by interpolation.
+        light = np.linspace(0, 1, 1024, dtype=np.float32)
+        values = correction.apply(light)
+        inverse = np.array([light[values == v].mean() if (values == v).any() else np.nan for v in range(256)])
+        known = np.isfinite(inverse)
+        inverse = np.interp(np.arange(256), np.flatnonzero(known), inverse[known])
+        shown = inverse[correction.apply(meant)]
+    design = design_matrix(pattern, finest.shifts, range(finest.shifts))
+    parts = [np.linalg.lstsq(design, light, rcond=None)[0] for light in (meant.astype(np.float64), shown)]
+    angles = [np.arctan2(q, p) for _, p, q in parts]
+    apart = np.angle(np.exp(1j * (angles[1] - angles[0])))
+    return float(np.sqrt(np.mean(apart**2)) * along / finest.frequency / (2 * np.pi))
+
+
+def _line(image: Any, axis: Axis) -> Any:
+    return image[:, 0] if axis == "y" else image[0]
+
+
+def _sync(sequence: PatternSequence, mixed: float | None, axis: Axis) -> Contribution:
+    """Light of a neighbouring pattern that time stamps cannot exclude."""
+    if mixed is None:
+        return Contribution("sync", "systematic", None, None, "no time stamps: the frames' content alone was judged")
+    if mixed == 0:
+        return Contribution("sync", "systematic", 0.0, 0.0, "every frame proved to have seen its pattern alone")
+    pattern = sequence.pattern
+    if not isinstance(pattern, PmpPattern) or mixed >= 1:
+        says = f"up to {mixed:.1%} of an exposure may have seen the next pattern, as far as stamps tell"
+        return Contribution("sync", "systematic", None, None, says)
+    # The next shift's light, in every frame alike, turns all phases by its share of a shift; anywhere up to that.
+    finest = max((s for s in pattern.sets() if s.axis == axis), key=lambda s: s.frequency)
+    bound = mixed / finest.shifts * sequence.projector.along(axis) / finest.frequency
+    says = f"up to {mixed:.1%} of an exposure may have seen the next pattern (bound {bound:.3f} px, rectangular)"
+    return Contribution("sync", "systematic", bound / math.sqrt(3), None, says)

@@ -1,0 +1,127 @@
+"""The budget: calibration by random draws, grey levels by decoding them, sums that are sums, and what is unknown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scanner.calibration_spread import LENS_MEMBERS, depth_spread, moved
+from scanner.decode import decoder_for
+from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, PmpPattern, ProjectorSize
+from scanner.patterns.sequence import Precorrection
+from scanner.scan import build_scan
+from scanner.triangulation import triangulate
+from scanner.uncertainty import budget_of, grey_level_px
+
+NAMES = [f"{part}.{name}" for part in ("camera", "projector") for name in LENS_MEMBERS]
+NAMES += [f"{part}.{axis}" for part in ("rotation", "translation") for axis in "xyz"]
+SIGMAS = np.array([1.2, 1.2, 1.5, 1.5, 2e-3, 5e-3, 2e-4, 2e-4, 0] * 2 + [5e-4] * 3 + [0.3, 0.3, 0.5])
+SEQUENCE = PatternSequence(ProjectorSize(400, 300), PmpPattern(("y",), (1.0, 8.0, 24.0), (4, 4, 4)))
+LIGHT = {"y": {"harmonics": [{"frequency": 24.0, "ripple_px": 0.04}]}}
+UNWRAPPING = {"y": {"ripple": {"px": 0.02}}}
+
+
+def matrix():
+    """A covariance in which focal lengths and depths of the rig go together."""
+    correlated = np.eye(len(NAMES))
+    for one, two in (("camera.fx", "camera.fy"), ("projector.fy", "translation.z"), ("rotation.x", "projector.cy")):
+        correlated[NAMES.index(one), NAMES.index(two)] = correlated[NAMES.index(two), NAMES.index(one)] = 0.8
+    return correlated * SIGMAS[:, None] * SIGMAS
+
+
+@pytest.fixture
+def scene(rig_of, scene_with):
+    return scene_with(rig_of("y", camera_k=(-0.08, 0.02, 0, 0, 0)), lambda x, y: 700 + 60 * x + 20 * np.sin(9 * y))
+
+
+def scan_of(scene, **details):
+    decoded = replace(scene.decoded(noise_px=0.05), details=details)
+    return build_scan(decoded, scene.calibration)
+
+
+def with_covariance(calibration, **extra):
+    content = {"parameters": NAMES, "matrix": matrix().tolist()}
+    return replace(calibration, extra={"covariance": content, **extra})
+
+
+def test_a_calibrations_covariance_spreads_depth_as_random_rigs_do(scene):
+    known = with_covariance(scene.calibration)
+    stated = depth_spread(known, scan_of(scene), "y")
+    random, depths = np.random.default_rng(1), []
+    values = np.full(scene.truth.rows.shape, np.nan, np.float32)
+    values[::16, ::16] = np.where(scene.lit, scene.truth.rows, np.nan)[::16, ::16]
+    for draw in random.multivariate_normal(np.zeros(len(NAMES)), matrix(), 150, method="svd"):
+        rig = scene.calibration
+        for name, step in zip(NAMES, draw, strict=True):
+            rig = moved(rig, name, step)
+        depths.append(triangulate(rig, rows=values).xyz[::16, ::16, 2])
+    spread = np.sqrt(np.nanmean(np.var(depths, axis=0, ddof=1)))
+    assert stated == pytest.approx(spread, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    "covariance",
+    [None, {"matrix": [[1.0]]}, {"parameters": ["camera.fx"], "matrix": [[1.0, 0.0]]},
+     {"parameters": ["camera.gain"], "matrix": [[1.0]]}, {"parameters": ["camera.fx"], "matrix": [["a"]]}],
+)  # fmt: skip
+def test_without_a_usable_covariance_it_is_unknown(scene, covariance):
+    rig = replace(scene.calibration, extra={"covariance": covariance})
+    found = budget_of(scan_of(scene), rig, SEQUENCE, 0.0)
+    assert found is not None
+    assert "calibration" in found.unknown
+    assert np.isfinite(found.combined_mm)
+
+
+def test_sums_are_those_of_what_is_known(scene):
+    rig = with_covariance(scene.calibration, scale="unverified")
+    found = budget_of(scan_of(scene, light=LIGHT, unwrapping=UNWRAPPING), rig, SEQUENCE, 0.1)
+    assert found is not None
+    told = found.as_dict()
+    by_name = {c["name"]: c for c in told["contributions"]}
+    assert list(by_name) == ["noise", "calibration", "response", "grey levels", "sync"]
+    assert by_name["noise"]["px"] == pytest.approx(0.05, rel=0.01)
+    assert [c["kind"] for c in told["contributions"]] == ["random", *["systematic"] * 4]
+    assert by_name["response"]["px"] == 0.04
+    per_px = by_name["noise"]["mm"] / by_name["noise"]["px"]
+    assert by_name["response"]["mm"] == pytest.approx(0.04 * per_px, rel=0.02)
+    # A tenth of the next shift's light: a fortieth of a period of 300 / 24 px, rectangular.
+    assert by_name["sync"]["px"] == pytest.approx(0.1 / 4 * 300 / 24 / np.sqrt(3))
+    assert "absolute scale is unverified" in by_name["calibration"]["says"]
+    systematic = np.sqrt(sum(by_name[n]["mm"] ** 2 for n in ("calibration", "response", "grey levels", "sync")))
+    assert told["systematic_mm"] == pytest.approx(systematic)
+    assert told["random_mm"] == pytest.approx(by_name["noise"]["mm"])
+    assert told["expanded_mm"] == pytest.approx(2 * np.hypot(told["random_mm"], systematic))
+    assert told["unknown"] == []
+    assert told["depth_mm"] == pytest.approx(np.nanmedian(scene.truth.xyz[..., 2][scene.lit]), abs=1)
+
+
+def test_what_cannot_be_told_is_in_no_sum(scene):
+    single = replace(SEQUENCE, pattern=PmpPattern(("y",), (1.0,), (4,)))
+    found = budget_of(scan_of(scene), scene.calibration, single, None)
+    assert found is not None
+    assert found.unknown == ("calibration", "response", "sync")
+    gray = PatternSequence(ProjectorSize(400, 300), GrayPattern(("y",), 9, 9))
+    found = budget_of(scan_of(scene), scene.calibration, gray, 0.2)
+    assert found is not None
+    assert [c.name for c in found.contributions] == ["noise", "calibration", "sync"]
+    assert found.unknown == ("calibration", "sync")
+    nothing = replace(scan_of(scene), xyz=None)
+    assert budget_of(nothing, scene.calibration, gray, 0.0) is None
+
+
+@pytest.mark.parametrize("gamma", [None, 2.2])
+@pytest.mark.parametrize("shifts", [3, 8])
+def test_grey_levels_shift_phases_as_decoding_the_images_shows(gamma, shifts):
+    """A camera without noise that sees each projector pixel alone, and grey levels 250 times as fine as shown."""
+    size = ProjectorSize(64, 512)
+    correction = None if gamma is None else Precorrection(gamma=gamma)
+    sequence = PatternSequence(size, PmpPattern(("y",), (1.0, 30.5), (shifts, shifts)), precorrection=correction)
+    camera = CameraFormat(64, 512, 16)
+    decoder = decoder_for(sequence, camera)
+    for position in range(len(sequence)):
+        light = (sequence.image(position) / 255.0) ** (gamma or 1.0)
+        decoder.add(position, np.rint(1000 + 60_000 * light).astype(np.uint16))
+    error = decoder.finish().rows - np.arange(512)[:, None]
+    assert grey_level_px(sequence, "y") == pytest.approx(np.sqrt(np.nanmean(error**2)), rel=0.1)
