@@ -9,7 +9,9 @@ Of a device in use its driver says when it goes (`DeviceLost`), of an idle one o
 
 from __future__ import annotations
 
+import gc
 import logging
+import traceback
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -72,6 +74,7 @@ class HeldDevices:
         """Give all up because one went away, and say so."""
         _log.warning("devices lost: %s", error)
         self.close()
+        _let_go(error)
         self._say(DeviceFault(error_body(error)))
         self._pause_ns = AGAIN_NS[0]
         self._due_ns = self._clock.now_ns() + self._pause_ns
@@ -132,6 +135,12 @@ class HeldDevices:
         rig = self._opened.rig
         devices: list[object] = [rig.camera, rig.projector, rig.trigger]
         return [device for device in devices if isinstance(device, KnowsPresence)]
+
+
+def _let_go(error: ScannerError) -> None:
+    """Calls that the error ended may hold a frame, and with it the driver's memory and a node that is gone."""
+    traceback.clear_frames(error.__traceback__)
+    gc.collect()
 
 
 def described(opened: OpenRig) -> Opened:

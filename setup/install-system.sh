@@ -1,9 +1,12 @@
 #!/usr/bin/env bash
 # Installs fringed as a service: program below PREFIX, units, udev rules, users, kernel settings; `--remove` undoes it.
-# PREFIX (default /usr/local) and DESTDIR (a staging folder, for packagers) are taken from the environment.
+# `--prepare` is the last step alone (users, folders, kernel settings, rules read anew), for what a package has unpacked.
+# PREFIX (default /usr/local) and DESTDIR (a staging folder, for packagers) are taken from the environment; WHEELS is
+# a folder of wheels for a machine without network: pip wheel --wheel-dir FOLDER --constraint setup/constraints.txt .
 # Captures, scans and /etc/fringed/rig.toml are never touched.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
+umask 022 # what is installed is for every user to read, whatever root's own is
 prefix=${PREFIX:-/usr/local}
 stage=${DESTDIR:-}
 home=$prefix/lib/fringed
@@ -41,12 +44,24 @@ remove() {
 }
 
 install_program() {
+    local wanted
+    sources=$(mktemp -d)
+    trap 'rm -rf "$sources"' EXIT
+    if [ -n "${WHEELS:-}" ]; then
+        wanted=(--no-index --find-links "$WHEELS" fringed)
+    else
+        # A copy: building leaves files behind, and what an earlier build left in the clone would be installed again.
+        cp -r pyproject.toml README.md LICENSE scanner drivers service "$sources/"
+        find "$sources" -name __pycache__ -prune -exec rm -rf {} +
+        wanted=("$sources")
+    fi
     say "installing the program into $stage$home (a minute or two)"
     mkdir -p "$stage$home" "$stage$prefix/bin"
     /usr/bin/python3 -m venv --clear --system-site-packages "$stage$home"
     env -u PYTHONPATH -u PYTHONHOME -u PIP_USER PIP_DISABLE_PIP_VERSION_CHECK=1 \
-        "$stage$home/bin/python" -m pip install --quiet --no-cache-dir --constraint setup/constraints.txt . >&2 ||
+        "$stage$home/bin/python" -m pip install --quiet --no-cache-dir --constraint setup/constraints.txt "${wanted[@]}" >&2 ||
         fail "Python packages could not be installed: see the lines above."
+    rm -rf "$sources"
     # Scripts that pip writes hold the staging folder's path; this one does not.
     printf '#!/bin/sh\nexec %s/bin/python -P -m service.cli "$@"\n' "$home" >"$stage$prefix/bin/fringed"
     chmod 755 "$stage$prefix/bin/fringed"
@@ -63,7 +78,6 @@ install_files() {
 }
 
 prepare_system() {
-    [ -z "$stage" ] || { say "staged below $stage: users, folders and kernel settings are the package's to make"; return; }
     systemd-sysusers "$conf/sysusers.d/fringed.conf"
     systemd-tmpfiles --create "$conf/tmpfiles.d/fringed.conf"
     sysctl -q -p "$conf/sysctl.d/70-fringed.conf" || say "kernel settings take effect at the next boot"
@@ -75,6 +89,11 @@ prepare_system() {
 [ -n "$stage" ] || [ "$(id -u)" = 0 ] || fail "this takes root (sudo make install), or DESTDIR= for a staging folder"
 case ${1:-} in
     --remove) remove ;;
-    '') install_program; install_files; prepare_system ;;
+    --prepare) prepare_system ;;
+    '')
+        install_program
+        install_files
+        if [ -n "$stage" ]; then say "staged below $stage: where it is unpacked, run setup/install-system.sh --prepare"
+        else prepare_system; fi ;;
     *) fail "unknown argument: $1" ;;
 esac

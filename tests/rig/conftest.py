@@ -6,11 +6,14 @@ import os
 
 import pytest
 
-IN_THE_GUEST = bool(os.environ.get("RIG_IN_A_BOX"))
+MODE = os.environ.get("RIG_IN_A_BOX")
+"""How the guest was booted: "fast" for the drivers, "systemd" for the service; None: this is no guest"""
 
-collect_ignore_glob = [] if IN_THE_GUEST else ["test_*.py"]
+LEFT_OUT = {None: ["test_*.py"], "fast": ["test_installed*.py"], "systemd": []}
+
+collect_ignore_glob = LEFT_OUT[MODE]
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    if not IN_THE_GUEST:
+    if MODE is None:
         terminalreporter.write_line("tests/rig was left out: it runs in a guest with real kernel devices, `make rig`")

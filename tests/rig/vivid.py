@@ -29,9 +29,13 @@ def unplug() -> None:
     (_DRIVER / "unbind").write_text("vivid.0")
 
 
+def bind() -> None:
+    (_DRIVER / "bind").write_text("vivid.0")
+
+
 def plug_in() -> None:
     """Bind again, and wait for the nodes."""
-    (_DRIVER / "bind").write_text("vivid.0")
+    bind()
     deadline = time.monotonic() + 10
     while not all(Path(node).exists() for node in (CAMERA, PROJECTOR)):
         assert time.monotonic() < deadline
