@@ -6,18 +6,20 @@ the first board that answers.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+from drivers.option_table import read_options
 from drivers.serial_trigger.board import BoardOptions, SerialTriggerBoard
 from drivers.serial_trigger.link import Link
 from drivers.serial_trigger.ports import candidates, paths_for
+from drivers.serial_trigger.protocol import Message
 from drivers.serial_trigger.transport import SerialTransport
 from scanner.clock import Clock
 from scanner.devices import DeviceInfo
-from scanner.errors import ConfigError, DeviceError, DeviceLost
-from scanner.trigger_protocol import OUTPUTS, PROTOCOL, TIMEOUT_MAX_MS
+from scanner.errors import DeviceError, DeviceLost
+from scanner.trigger_protocol import PROTOCOL
 
 DRIVER = "serial"
 
@@ -46,7 +48,7 @@ class SerialTriggerDriver:
             ConfigError: an option makes no sense, or the port is none.
             DeviceNotFound, DeviceBusy, PermissionDenied, DeviceError: it cannot be opened, or is another device.
         """
-        chosen = read_options(options)
+        chosen = read_options(BoardOptions, options, device or "trigger board")
         return SerialTriggerBoard(lambda on_message: connect(device, clock, on_message), chosen, clock)
 
     def discover(self) -> Sequence[DeviceInfo]:
@@ -63,7 +65,7 @@ class SerialTriggerDriver:
         ]
 
 
-def connect(device: str, clock: Clock, on_message: Any) -> Found:
+def connect(device: str, clock: Clock, on_message: Callable[[Message], None]) -> Found:
     """The first board at `device` that introduces itself.
 
     Raises:
@@ -76,36 +78,6 @@ def connect(device: str, clock: Clock, on_message: Any) -> Found:
         except DeviceError as error:
             failure = error
     raise failure or DeviceError("no port to try", device=device)
-
-
-def read_options(options: Mapping[str, Any]) -> BoardOptions:
-    """The option table, checked.
-
-    Raises:
-        ConfigError: an unknown option, or a value that makes no sense.
-    """
-    known = {field.name for field in fields(BoardOptions)}
-    for key in options:
-        if key not in known:
-            raise ConfigError(f"unknown option {key!r} of the serial trigger board", hint=f"known: {sorted(known)}")
-    given = dict(options)
-    if "outputs" in given:
-        given["outputs"] = _outputs(given["outputs"])
-    chosen = BoardOptions(**given)
-    if chosen.edge not in ("rising", "falling"):
-        raise ConfigError(f"option edge is {chosen.edge!r}", hint='"rising" or "falling"')
-    timeout = chosen.timeout_ms
-    if timeout is not None and (not isinstance(timeout, int) or not 0 <= timeout <= TIMEOUT_MAX_MS):
-        raise ConfigError(f"option timeout_ms is {timeout!r}", hint=f"whole milliseconds, 0 .. {TIMEOUT_MAX_MS}")
-    return chosen
-
-
-def _outputs(given: Any) -> tuple[str, ...]:
-    names = tuple(given) if isinstance(given, list | tuple) else (given,)
-    wrong = [name for name in names if name not in OUTPUTS]
-    if wrong or not names:
-        raise ConfigError(f"option outputs: {wrong or given!r} is none", hint=f"a list of {', '.join(OUTPUTS)}")
-    return names
 
 
 def _introduced(link: Link, clock: Clock) -> Found:

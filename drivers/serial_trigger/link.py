@@ -29,6 +29,9 @@ SILENCES = 3
 QUIET_S = 0.03
 """After a damaged line, nothing may come for so long before the next request: what noise made of one line can be two"""
 
+QUIET_MOST_S = 0.3
+"""A line that never falls silent is not waited for: another device talks there, and no request is answered"""
+
 _NOISE = {1, 6}
 """Refusals that say the request did not arrive whole: crc, line"""
 
@@ -206,7 +209,8 @@ class Link:
         return damaged
 
     def _wait_for_quiet(self) -> None:
-        while self._next_answer(QUIET_S) is not None:
+        until = self._clock.now_ns() + round(1e9 * QUIET_MOST_S)
+        while self._next_answer(QUIET_S) is not None and self._clock.now_ns() < until:
             pass
 
     def _clear_answers(self) -> None:
