@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from scanner.calibration.watch import watched
 from scanner.capture import Capture, CaptureHeader
 from scanner.capture.exposure import exposure_report, exposure_warnings
 from scanner.carrier_check import require_carriers
@@ -27,6 +28,7 @@ from scanner.errors import CalibrationError, DecodeError
 from scanner.filters import FilterSettings
 from scanner.geometry import Calibration, load_calibration
 from scanner.patterns import McpPattern, PatternSequence, PmpPattern
+from scanner.ripple_correction import without_ripple
 from scanner.scale_check import require_codes_within, require_geometry
 from scanner.scan import Scan, build_scan
 from scanner.sequencer import check_capture
@@ -45,6 +47,8 @@ class DecodeOptions:
     decoder: str = "default"
     filters: FilterSettings = field(default_factory=FilterSettings)
     compare_truth: bool = False
+    correct_ripple: bool = False
+    """PMP: take off what the response has put into coordinates, as far as the frequencies tell"""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data, for the wire and for reports."""
@@ -61,6 +65,7 @@ class DecodeOptions:
             decoder=str(content.get("decoder", "default")),
             filters=FilterSettings.from_dict(content.get("filters") or {}),
             compare_truth=bool(content.get("compare_truth", False)),
+            correct_ripple=bool(content.get("correct_ripple", False)),
         )
 
 
@@ -137,6 +142,8 @@ class Reconstruction:
         if len(self._header.sequence) > 1:
             # The witnesses have seen light: without it the check ends in an error of its own.
             raise_if_empty(decoded)
+        if self._options.correct_ripple:
+            decoded = without_ripple(decoded, self._header.sequence)
         decoded = self._carriers_fit(self._fits_geometry(decoded), capture)
         tell("triangulating")
         scan = build_scan(decoded, self._calibration, self._options.filters, timings=self._timings)
@@ -148,6 +155,8 @@ class Reconstruction:
             capture=self._capture_report(capture),
             uncertainty=self._budget(scan, check.mixed_share),
         )
+        with self._timed("drift and marks"):
+            scan = watched(scan, self._calibration, self._header)
         if self._options.compare_truth:
             tell("comparing with truth")
             scan = self._compared(scan, capture)

@@ -138,7 +138,8 @@ def _response(scan: Scan, sequence: PatternSequence, axis: Axis) -> Contribution
     finest = max(harmonics, key=lambda h: float(h["frequency"]), default=None)
     found = [float(ripple["px"])] if ripple else []
     if finest is not None and finest.get("ripple_px") is not None:
-        found.append(float(finest["ripple_px"]))
+        # Where the ripple was taken off, that of the other sets says nothing any more.
+        found = [*([] if finest.get("corrected") else found), float(finest["ripple_px"])]
     if not found:
         return Contribution("response", "systematic", None, None, "one frequency has nothing to contradict it")
     says = "rms by which frequencies differ beyond noise: harmonics that pass for the fringe, light among surfaces"

@@ -61,6 +61,7 @@ class SetHarmonics:
     ripple_px: float | None = None
     """rms of the error that overtones which pass for the fringe put into this set's coordinates, projector px; None
     where the set has too many shifts for any, or where nothing contradicts it"""
+    ripple: RippleFit | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For report.json."""
@@ -200,14 +201,32 @@ def _left(sums: NDArray[np.float64], ratio: complex, folded: bool) -> complex:
     return complex(sums[SEEN_REAL], sums[SEEN_IMAGINARY]) - (meant.real if folded else meant)
 
 
+@dataclass(frozen=True)
+class RippleFit:
+    """Overtones that pass for a set's fringe: its error is cosine_px cos(N phase) + sine_px sin(N phase).
+
+    share: of the fringe's height. sigma_px: 1-sigma of either coefficient, projector px.
+    """
+
+    share: float
+    cosine_px: float
+    sine_px: float
+    sigma_px: float
+
+    @property
+    def rms_px(self) -> float:
+        """Over all phases."""
+        return float(np.hypot(self.cosine_px, self.sine_px) / np.sqrt(2))
+
+
 def ripples(
     ladder: Ladder,
     remainders: Sequence[NDArray[np.float64]],
     phases: NDArray[np.float32],
     shifts: Sequence[int],
     periods_px: Sequence[float],
-) -> list[tuple[float, float] | None]:
-    """By set: share of the fringe's height that overtones passing for it have, and rms of the error they cause, px.
+) -> list[RippleFit | None]:
+    """By set, what of it repeats N times a period in how the frequencies contradict one another.
 
     Args:
         remainders: (n,) of each step of the ladder, cycles. phases: (K, n) cycles. periods_px: projector px a cycle.
@@ -215,31 +234,37 @@ def ripples(
     Returns:
         None for a set of many shifts, one that no other contradicts, and where there are too few pixels.
     """
-    found: list[tuple[float, float] | None] = [None] * len(shifts)
+    found: list[RippleFit | None] = [None] * len(shifts)
     harmed = [k for k, n in enumerate(shifts) if 3 <= n < FEWEST_SHIFTS_UNHARMED]
     for remainder, errors in zip(remainders, ladder.errors, strict=True):
         members = [k for k in harmed if errors[k] != 0]
         # Far ones are of another order, and tell nothing of a ripple.
         near = np.abs(remainder - np.median(remainder)) < 0.3 if remainder.size else np.zeros(0, np.bool_)
-        if not members or np.count_nonzero(near) < LEAST_PIXELS:
+        count = int(np.count_nonzero(near))
+        if not members or count < LEAST_PIXELS:
             continue
-        columns = [np.ones(int(near.sum()))]
+        columns = [np.ones(count)]
         for k in members:
             turns = 2 * np.pi * shifts[k] * phases[k][near].astype(np.float64)
             columns += [np.cos(turns), np.sin(turns)]
         design = np.stack(columns, axis=1)
-        parts = np.linalg.lstsq(design, remainder[near], rcond=None)[0][1:].reshape(-1, 2)
-        for k, part in zip(members, parts, strict=True):
-            cycles = float(np.hypot(*part)) / abs(errors[k])
-            found[k] = float(2 * np.pi * cycles), float(periods_px[k] * cycles / np.sqrt(2))
+        solved = np.linalg.lstsq(design, remainder[near], rcond=None)[0]
+        left = float(np.std(remainder[near] - design @ solved))
+        for k, (cosine, sine) in zip(members, solved[1:].reshape(-1, 2), strict=True):
+            # A remainder is the sum of the sets' errors, each times its weight.
+            px = periods_px[k] / float(errors[k])
+            share = float(2 * np.pi * np.hypot(cosine, sine) / abs(errors[k]))
+            found[k] = RippleFit(
+                share, float(cosine) * px, float(sine) * px, left * float(np.sqrt(2 / count)) * abs(px)
+            )
     return found
 
 
-def named_ripple(harmonics: SetHarmonics, ripple: tuple[float, float] | None) -> SetHarmonics:
+def named_ripple(harmonics: SetHarmonics, ripple: RippleFit | None) -> SetHarmonics:
     """With what passes for the fringe: with three shifts the second overtone (and fourth), with four the third."""
     if ripple is None:
         return harmonics
-    share, px = ripple
+    told = replace(harmonics, ripple_px=ripple.rms_px, ripple=ripple)
     if harmonics.shifts == 3:
-        return replace(harmonics, second=share, ripple_px=px)
-    return replace(harmonics, third=share, ripple_px=px) if harmonics.shifts == 4 else replace(harmonics, ripple_px=px)
+        return replace(told, second=ripple.share)
+    return replace(told, third=ripple.share) if harmonics.shifts == 4 else told

@@ -33,7 +33,7 @@ from scanner.decode.unwrapping import Ladder
 THINNED = 8
 """Of the sample's runs, one in so many is asked for overtones: five hundred pixels tell a share to .0005."""
 
-THINNED_RIPPLE = 4
+THINNED_RIPPLE = 2
 """The same for ripples, which are told by remainders alone."""
 
 LEAST_EXPLAINED = 0.02

@@ -44,6 +44,10 @@ def decode(
     box: Box = None,
     min_confidence: MinConfidence = None,
     edge_filter: EdgeFilter = True,
+    correct_ripple: Annotated[
+        bool,
+        typer.Option("--correct-ripple", help="PMP of 3 to 5 shifts: take off the ripple that the response has left."),
+    ] = False,
     compare_truth: Annotated[
         bool, typer.Option("--compare-truth", help="Captures of simulated rigs: compare with the truth.")
     ] = False,
@@ -81,7 +85,8 @@ def decode(
         from scanner.stage_pictures import StageFolder  # noqa: PLC0415
         from scanner.storage import prepare_output  # noqa: PLC0415
 
-        options = DecodeOptions.from_dict({"decoder": decoder, "filters": filters, "compare_truth": compare_truth})
+        chosen = {"decoder": decoder, "filters": filters, "compare_truth": compare_truth}
+        options = DecodeOptions.from_dict({**chosen, "correct_ripple": correct_ripple})
         opened = Capture.open(capture)
         lens_file = calibration_for(opened, calibration)
         folder = output or opened.path / "scan"

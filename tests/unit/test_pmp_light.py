@@ -9,6 +9,7 @@ from scanner.decode import decoder_for
 from scanner.decode.harmonics import height_weights, spectra_of
 from scanner.decode.pmp_frames import axis_frames
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
+from scanner.ripple_correction import without_ripple
 
 PROJECTOR = ProjectorSize(320, 240)
 CAMERA = CameraFormat(240, 160)
@@ -159,3 +160,21 @@ def test_sets_that_lost_frames_and_dark_images_tell_nothing():
     dark = decoded(pattern, [np.full(CAMERA.shape, 5, np.uint8)] * 16)
     assert of_set(dark)["second"] is None
     assert dark.details["light"]["y"]["flicker"] is None
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.3])
+def test_a_ripple_can_be_taken_off(exponent):
+    pattern = PmpPattern(("y",), (1.0, 8.0, 24.0), (3, 3, 3))
+    found = decoded(pattern, shown(pattern, exponent, noise=0.6))
+    straight = without_ripple(found, PatternSequence(PROJECTOR, pattern))
+    before, after = (np.sqrt(np.nanmean((maps.rows - rows_seen()) ** 2)) for maps in (found, straight))
+    noise = float(np.nanmedian(found.sigma_rows))
+    if exponent == 1.0:
+        np.testing.assert_array_equal(straight.rows, found.rows)
+        return
+    assert before > 1.8 * noise
+    assert after < 1.1 * noise
+    told = of_set(straight)
+    assert told["corrected"]
+    assert told["ripple_px"] < 0.3 * of_set(found)["ripple_px"]
+    np.testing.assert_array_equal(np.isnan(straight.rows), np.isnan(found.rows))
