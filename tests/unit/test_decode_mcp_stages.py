@@ -7,7 +7,18 @@ from itertools import product
 import numpy as np
 import pytest
 
-from scanner.decode.mcp import carriers, dense, dense_lines, emissions, hmm, linking, magnification, stripes, subpixel
+from scanner.decode.mcp import (
+    carriers,
+    dense,
+    dense_lines,
+    emissions,
+    exponentials,
+    hmm,
+    linking,
+    magnification,
+    stripes,
+    subpixel,
+)
 from scanner.decode.mcp.model import PatternModel
 from scanner.patterns import McpPattern, ProjectorSize
 
@@ -58,16 +69,41 @@ def test_peaks_of_a_triangle_wave():
     line = 10 + 80 * (1 - np.abs(2 * ((y - 7.25) / 40 % 1) - 1))
     reduced = np.tile(np.float32(line), (12, 1))
     peaks = stripes.find_peaks(reduced, 40.0, 16.0, 0.1)
-    assert (np.diff(peaks.start) == 10).all()
-    np.testing.assert_allclose(peaks.y[:10], 27.25 + 40 * np.arange(10), atol=0.1)
+    # The flank of a stripe beyond the border ends on the border row.
+    assert (np.diff(peaks.start) == 11).all()
+    assert peaks.y[0] == 0
+    np.testing.assert_allclose(peaks.y[1:11], 27.25 + 40 * np.arange(10), atol=0.1)
     # Smoothing by a twelfth of a pitch takes .16 of the height at the top and as much at the valleys.
-    assert ((peaks.height[1:9] > 55) & (peaks.height[1:9] < 80)).all()
-    assert ((peaks.valley[1:9] > 10) & (peaks.valley[1:9] < 25)).all()
+    assert ((peaks.height[1:11] > 55) & (peaks.height[1:11] < 80)).all()
+    assert ((peaks.valley[1:11] > 10) & (peaks.valley[1:11] < 25)).all()
     chains = linking.link(peaks, 40.0)
     assert (chains.lengths == 12).all()
-    assert sorted(chains.order) == list(range(120))
-    fine = subpixel.refine(reduced, peaks, chains, np.tile(np.arange(10, dtype=np.int32), 12), 40.0)
-    np.testing.assert_allclose(fine.y[1:9], 67.25 + 40 * np.arange(8), atol=0.03)
+    assert sorted(chains.order) == list(range(132))
+    fine = subpixel.refine(reduced, peaks, chains, np.tile(np.arange(11, dtype=np.int32), 12), 40.0)
+    np.testing.assert_allclose(fine.y[1:11], 27.25 + 40 * np.arange(10), atol=0.03)
+    np.testing.assert_array_equal(fine.whole, np.arange(132) % 11 > 0)
+
+
+@pytest.mark.parametrize("end", ["top", "bottom"])
+def test_a_stripe_that_leaves_the_image_is_followed_to_its_border(end):
+    y, columns = np.arange(200), np.arange(45)
+    at = 18.3 - 0.6 * columns  # leaves at column 30
+    light = 1 - np.abs(2 * (((y[None, :] - at[:, None]) / 40 + 0.5) % 1) - 1)
+    light = light if end == "top" else light[:, ::-1]
+    at = at if end == "top" else 199 - at
+    reduced = np.ascontiguousarray(10 + 80 * light, np.float32)
+    peaks = stripes.find_peaks(reduced, 40.0, 16.0, 0.1)
+    chains = linking.link(peaks, 40.0)
+    first = peaks.start[:-1] if end == "top" else peaks.start[1:] - 1
+    label = np.full(len(peaks), -1, np.int32)
+    label[first] = 4
+    fine = subpixel.refine(reduced, peaks, chains, label, 40.0)
+    inside = (at > 0.3) & (at < 198.7) & (columns > 2)  # not where smoothing along it meets its image
+    np.testing.assert_allclose(fine.y[first][inside], at[inside], atol=0.25)
+    assert (fine.whole[first][inside] == 1).all()
+    assert (fine.whole[first][(at < -0.3) | (at > 199.3)] == 0).all()
+    near = inside & ((at < 2) | (at > 197))
+    assert (fine.sigma[first][near] >= 0.2).all()
 
 
 def test_a_slope_of_brightness_does_not_move_the_peak():
@@ -305,3 +341,31 @@ def test_rows_alone_are_those_of_all_maps_and_a_lower_run_has_the_say_where_two_
     line = maps.rows[:, 3]
     np.testing.assert_allclose(line[20:57], np.interp(np.arange(20, 57), y[:2], row[:2]), atol=1e-3)
     np.testing.assert_allclose(line[57:74], 235 - 27 / 40 * np.arange(16, -1, -1), atol=1e-3)
+
+
+def test_exponentials_and_logarithms_are_right_to_two_roundings():
+    x = np.concatenate([np.linspace(-86.9, 0, 700), -np.geomspace(1e-9, 1, 100)]).astype(np.float32)
+    np.testing.assert_allclose([exponentials.exp_of(v) for v in x], np.exp(np.float64(x)), rtol=1.5e-7)
+    y = np.concatenate([np.geomspace(1e-37, 1e37, 700), 1 + np.linspace(-0.4, 0.6, 301)]).astype(np.float32)
+    np.testing.assert_allclose([exponentials.log_of(v) for v in y], np.log(np.float64(y)), rtol=1.5e-7, atol=1.5e-7)
+
+
+@pytest.mark.parametrize("model", [OWN, PUBLISHED], ids=["own", "published"])
+def test_likelihoods_are_those_of_rayleigh_and_rice(model):
+    random = np.random.default_rng(2)
+    count, channels = 40, model.channels
+    ratio, noise = random.uniform(0, 0.9, (count, channels)), random.uniform(0.005, 0.3, (count, channels))
+    seen = emissions.Amplitudes(np.float32(ratio), np.float32(noise), np.ones(count, np.float32))
+    modulation, floor = np.float32([0.9, 0.8, 0.7, 0.6]), np.float32([0.01, 0.02, 0.03, 0.04])
+    found, stray = emissions.log_likelihood(seen, model, modulation, floor)
+    sigma = np.hypot(noise, floor)
+    flat = 1 / (1.5 * model.ratio.max(axis=0) + 2.5 * sigma)
+    np.testing.assert_allclose(stray, np.log(flat).sum(axis=1), rtol=1e-5)
+    for s in range(model.stripes):
+        mean = model.ratio[s] * modulation
+        off = np.maximum(ratio / sigma, 0.02) / sigma * np.exp(-0.5 * (ratio / sigma) ** 2)
+        wide = np.hypot(sigma, emissions.SPREAD * mean)
+        on = 0.39894 / wide * np.exp(-0.5 * ((np.hypot(mean, sigma) - ratio) / wide) ** 2)
+        density = (1 - emissions.OUTLIER) * np.where(mean == 0, off, on) + emissions.OUTLIER * flat
+        dark = np.log(1e-4) if model.level[s] == 0 else 0
+        np.testing.assert_allclose(found[:, s], np.log(density).sum(axis=1) + dark, rtol=1e-4, atol=1e-4)

@@ -42,10 +42,6 @@ APART = 15
 HEIGHT_FLOOR = 0.04
 """Stripes lower than this share of the 99th percentile are left out: what lies outside the object (mcp.md, sec. 3)."""
 
-BORDER = 2
-"""Samples to either side of a peak without which it counts as cut by the image's border: one to fit, and one more for
-the slope there."""
-
 LEAST_FLANK = 0.45
 """Least ratio of a stripe's two flanks: below it one is cut off by an edge of the object."""
 
@@ -56,7 +52,8 @@ class Peaks:
 
     start: (B + 1,) int32, where each column's peaks begin. Of each peak (P,) float32: y px; height above the line
     between its valleys and brightness of that line, grey levels; above, below: y of the valleys. clear: uint8,
-    0 where a flank is missing or cut by the image's border.
+    0 where a flank is missing. A flank that the image's border cuts is taken for the other's mirror image; a peak on
+    the border row itself may lie beyond it.
     """
 
     start: NDArray[np.int32]
@@ -249,6 +246,11 @@ def _turning_points(line: Array, delta: np.float32, tops: NDArray[np.int32], low
         elif value > line[low_at] + delta:
             rising = True
             top_at = y
+    if rising and n > 0 and line[top_at] > line[low_at] + delta:  # cut by the column's end
+        lows[n] = low_at
+        tops[n] = top_at
+        n += 1
+        low_at = len(line) - 1
     lows[n] = low_at
     return n
 
@@ -267,16 +269,16 @@ def _describe(line: Array, top: int, above: int, below: int, pitch: np.float32, 
         low, high = line[above], line[below]
     left, right = line[top] - low, line[top] - high
     valley = low + (high - low) * (top - above) / max(below - above, 1)
-    curve = line[top - 1] - 2 * line[top] + line[top + 1]
     row[0] = top
-    if curve < 0:
-        row[0] += np.float32(0.5) * (line[top - 1] - line[top + 1]) / curve
-    inside = BORDER <= top <= size - 1 - BORDER
+    if 0 < top < size - 1:
+        curve = line[top - 1] - 2 * line[top] + line[top + 1]
+        if curve < 0:
+            row[0] += np.float32(0.5) * (line[top - 1] - line[top + 1]) / curve
     row[1] = line[top] - valley
     row[2] = valley
     row[3] = above
     row[4] = below
-    row[5] = 1.0 if inside and min(left, right) > np.float32(LEAST_FLANK) * max(left, right) else 0.0
+    row[5] = 1.0 if min(left, right) > np.float32(LEAST_FLANK) * max(left, right) else 0.0
 
 
 @kernel
@@ -292,7 +294,7 @@ def _peaks_of(smooth: Array, delta: np.float32, pitch: np.float32) -> tuple[NDAr
     for b in range(columns):
         for k in range(_turning_points(smooth[b], delta, tops, lows)):
             top = tops[k]
-            if 1 <= top <= size - 2 and count < capacity:
+            if count < capacity:
                 # A valley further than a pitch away is flat ground: its near end counts.
                 above, below = max(lows[k], top - int(pitch)), min(lows[k + 1], top + int(pitch))
                 _describe(smooth[b], top, above, below, pitch, rows[count])

@@ -40,6 +40,9 @@ SMOOTH = np.float32(0.01)
 """A fit to fewer samples, at the image's border, leaves no residual worth the name: such a share of the height is taken
 for it, what whole stripes leave."""
 
+NEAR_BORDER = 2 / 12
+"""Pitches from the image's border up to which smoothing moves a peak: two sigmas of `stripes.find_peaks`."""
+
 MOST_BEND = 0.3
 """Change of the pitch from one stripe to the next, in pitches, above which there is a step of depth between them."""
 
@@ -74,12 +77,14 @@ def refine(reduced: Array, peaks: Peaks, chains: Chains, label: Ints, pitch: flo
     """
     runs, ends = _runs(chains.order, chains.start, label)
     guess = _smoothed(peaks.y, runs, ends)
+    led = np.zeros(len(peaks), np.bool_)
+    _lead_on(guess, runs, ends, reduced.shape[1], np.float32(NEAR_BORDER * pitch), led)
     reach = max(3, int(REACH * pitch))
     count = len(peaks)
     y, sigma, whole = peaks.y.copy(), np.full(count, np.float32(0.5)), np.zeros(count, np.uint8)
     bend = _bends(guess, peaks.start, label, np.float32(pitch))
     sides = (peaks.above, peaks.below, peaks.valley, peaks.height)
-    _refine(reduced, guess, *sides, bend, chains.column, runs, ends, reach, y, sigma, whole)
+    _refine(reduced, guess, led, *sides, bend, chains.column, runs, ends, reach, y, sigma, whole)
     return Fine(y, sigma, whole)
 
 
@@ -122,6 +127,30 @@ def _smoothed(y: Array, runs: Ints, ends: Ints) -> Array:
 
 
 # Rows of matrices are named by matrix and number: a slice of its own costs more than the loop over 31 samples.
+
+
+@kernel
+def _lead_on(guess: Array, runs: Ints, ends: Ints, size: int, side: np.float32, led: NDArray[np.bool_]) -> None:
+    """Where a run nears the image's border its line further in leads on: peaks themselves are drawn to the border."""
+    support = 6
+    for r in range(len(ends) - 1):
+        for way in range(2):
+            # From the end inwards: how many are near the border, and the line through the six after them.
+            begin, step = (ends[r], 1) if way == 0 else (ends[r + 1] - 1, -1)
+            near, count = 0, ends[r + 1] - ends[r]
+            while near < count and not side <= guess[runs[begin + step * near]] <= size - 1 - side:
+                near += 1
+            if near == 0 or near + support > count:
+                continue
+            first, second = np.float32(0), np.float32(0)
+            for q in range(3):
+                first += guess[runs[begin + step * (near + q)]]
+                second += guess[runs[begin + step * (near + 3 + q)]]
+            slope = (first - second) / np.float32(9)
+            for q in range(near):
+                k = runs[begin + step * q]
+                guess[k] = first / np.float32(3) + slope * np.float32(near + 1 - q)
+                led[k] = True
 
 
 @kernel
@@ -223,6 +252,7 @@ def _longest_run(ends: Ints) -> int:
 def _refine(
     reduced: Array,
     guess: Array,
+    led: NDArray[np.bool_],
     above: Array,
     below: Array,
     valley: Array,
@@ -258,9 +288,11 @@ def _refine(
             worth[p] = determinant / ss if apart else np.float32(0)
         for p in range(count):
             ss, sv, vv, os, ov, oo = sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3], sums[p, 4], sums[p, 5]
-            if used[p] < 2 or ss <= 0:
-                continue
             k = runs[first + p]
+            if used[p] < 2 or ss <= 0:
+                if led[k] and 0 <= guess[k] <= reduced.shape[1] - 1:
+                    y[k], whole[k] = guess[k], 1  # its sigma stays
+                continue
             slope = _slope_at(p, count, kappa, worth)
             shift = (os - slope * sv) / ss
             left = (
