@@ -85,6 +85,7 @@ class AsyncClient:
         for reader in readers:
             reader.cancel()
         await asyncio.gather(*readers, return_exceptions=True)
+        self._subscribed = None
         if self._context is not None:
             self._context.destroy(linger=0)
             self._context = None

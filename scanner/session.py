@@ -217,7 +217,7 @@ def fetch(
 
     Raises:
         ScannerError: the job did not end well.
-        StorageError: no room, or a file arrives damaged twice.
+        StorageError: no room, or a file arrived damaged; under its name is nothing then, and it may be fetched again.
     """
     outcome = yield Call("scan.result", {"id": job_id})
     if not failed_too:

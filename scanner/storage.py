@@ -107,4 +107,4 @@ def storage_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise StorageError(f"{path}: {error.strerror}", hint=hints.get(error.errno or 0)) from error
+        raise StorageError(f"{path}: {error.strerror or error}", hint=hints.get(error.errno or 0)) from error

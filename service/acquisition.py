@@ -15,12 +15,13 @@ from msgspec import to_builtins
 from scanner.capture import CaptureHeader, CaptureWriter, FrameRecord, State
 from scanner.clock import Clock
 from scanner.devices import Image, KnowsTruth
-from scanner.errors import ConfigError, DeviceError, DeviceLost, ScannerError, StorageError, SyncError
+from scanner.errors import ConfigError, DeviceLost, ScannerError, StorageError
 from scanner.patterns import CameraFormat
 from scanner.sequencer import Acquisition, FinishReason, Plan, acquire, auto_exposure
-from scanner.storage import replace_json
+from scanner.storage import replace_json, storage_errors
 from scanner.stream import EndReason
 from scanner.wire import ScanStart, error_body
+from service.endings import reason_of
 from service.pipe import Began, Ended, Frames, Need, Report, Taken
 from service.scan_setup import OpenRig, sequence_for
 from service.write_back import WriteBack, WriteBacks
@@ -212,7 +213,9 @@ class Scan:
         if not self._params.compare_truth or not isinstance(camera, KnowsTruth):
             return
         truth = camera.truth()
-        np.savez(self._folder / "truth.npz", rows=truth.rows, columns=truth.columns, xyz=truth.xyz, lit=truth.lit)
+        path = self._folder / "truth.npz"
+        with storage_errors(path):
+            np.savez(path, rows=truth.rows, columns=truth.columns, xyz=truth.xyz, lit=truth.lit)
 
 
 def _check_filters(params: ScanStart) -> None:
@@ -222,18 +225,3 @@ def _check_filters(params: ScanStart) -> None:
         from scanner.filters import FilterSettings  # noqa: PLC0415  (brings the kernels; most scans give no filter)
 
         FilterSettings.from_dict(given)
-
-
-def reason_of(error: ScannerError) -> EndReason | None:
-    """How a run ends that this error ends; None: it never began."""
-    match error:
-        case DeviceLost():
-            return "device_lost"
-        case SyncError():
-            return "sync_lost"
-        case StorageError():
-            return "disk_full"
-        case DeviceError():
-            return "device_lost"
-        case _:
-            return None

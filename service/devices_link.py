@@ -54,6 +54,7 @@ KILL_S = 10.0
 DISCOVER_S = 30.0
 """Drivers look for twenty seconds at most, each in a process of its own."""
 
+_OPENING = "opening"
 _log = logging.getLogger(__name__)
 Publish = Callable[[str, str | None, Mapping[str, Any]], None]
 
@@ -89,7 +90,7 @@ class DevicesLink:
         self._opened: asyncio.Future[Opened] | None = None
         self._scans: dict[str, asyncio.Queue[Report | None]] = {}
         self._due: dict[str, float] = {}
-        """by job: when a devices process that says nothing must be gone, killing it included; the loop's time, s"""
+        """by job, or `_OPENING`: when a process that says nothing must be gone, killing included; the loop's time, s"""
         self._numbers = itertools.count(1)
         self._discoveries: dict[int, asyncio.Future[list[dict[str, Any]]]] = {}
         self._looking: asyncio.Task[list[dict[str, Any]]] | None = None
@@ -109,13 +110,8 @@ class DevicesLink:
         Raises:
             ScannerError: why they cannot be opened.
         """
-        if self._opened is None:
-            self._opened = asyncio.get_running_loop().create_future()
-            self._opened.add_done_callback(_seen)
-            self._child = await Child.start("service.devices_process", inherit=self._inherit, talks=True)
-            self._reader = asyncio.create_task(self._read(self._child))
-            self._send(Open(self._rig))
-        opened = self._opened
+        opened = self._opened or await self._start()
+        self._due.setdefault(_OPENING, asyncio.get_running_loop().time() + OPEN_S + KILL_S)
         try:
             async with asyncio.timeout(OPEN_S):
                 return await asyncio.shield(opened)
@@ -125,6 +121,8 @@ class DevicesLink:
                 f"the devices did not open within {OPEN_S:g} s",
                 hint="unplug and plug the camera, look at the log, and try `fringed devices`",
             ) from None
+        finally:
+            self._due.pop(_OPENING, None)
 
     async def acquire(
         self, job: str, folder: Path, params: ScanStart | LiveStart, listener: ScanListener
@@ -192,6 +190,20 @@ class DevicesLink:
             await self._child.stop()
         if self._reader is not None:
             await asyncio.gather(self._reader, return_exceptions=True)
+
+    async def _start(self) -> asyncio.Future[Opened]:
+        opened = self._opened = asyncio.get_running_loop().create_future()
+        opened.add_done_callback(_seen)
+        try:
+            self._child = await Child.start("service.devices_process", inherit=self._inherit, talks=True)
+        except OSError as error:
+            what = f"the devices process cannot be started: {error.strerror}"
+            self._fail_opening(DeviceError(what, hint="memory, processes or open files ran out: see the log"))
+            self._opened = None  # the next need tries again
+            return opened
+        self._reader = asyncio.create_task(self._read(self._child))
+        self._send(Open(self._rig))
+        return opened
 
     async def _follow(self, job: str, listener: ScanListener) -> Ended | None:
         """Until the devices are free; the end, if it has come by then."""

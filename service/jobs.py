@@ -180,7 +180,7 @@ class Job:
         """Read a job's file.
 
         Raises:
-            ValueError, TypeError, KeyError: it is none.
+            ValueError, TypeError, KeyError, AttributeError: it is none.
         """
         if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("version") != VERSION:
             raise ValueError(f"not a version {VERSION} {FORMAT} file")
@@ -300,7 +300,7 @@ class JobStore:
     def _load(self, path: Path) -> None:
         try:
             job = Job.from_record(msgspec.json.decode(path.read_bytes()))
-        except (msgspec.MsgspecError, ValueError, TypeError, KeyError) as error:
+        except (msgspec.MsgspecError, ValueError, TypeError, KeyError, AttributeError) as error:
             _log.error("job record %s is damaged and was left alone: %s", path, error)
             return
         self._jobs[job.id] = job

@@ -20,13 +20,15 @@ import msgspec
 
 from scanner.errors import DeviceBusy, ScannerError, StorageError
 from scanner.wire import LiveStart, Refused
+from service.deliveries import WorkerLost
 from service.devices_link import DevicesLink
+from service.endings import error_of, reason_to_fail
 from service.jobs import Job, JobState
 from service.live_files import close_recording, recorded_files, reserve
 from service.live_series import LiveSeries, LiveTotals
 from service.pipe import Ended, Frames, Kept, LiveBegan, Need, Shot
-from service.pipeline import Pipeline, error_of, reason_to_fail
-from service.worker_pool import WorkerLost, WorkerPool
+from service.pipeline import Pipeline
+from service.worker_pool import WorkerPool
 
 STATS_S = 1.0
 """Events of a run's counts come this often."""

@@ -16,7 +16,8 @@ from scanner.sequencer import EndlessFrame, endless
 from scanner.stream import EndReason
 from scanner.triangulation import require_depth_axis
 from scanner.wire import LiveStart, ScanStart, error_body
-from service.acquisition import Say, Scan, reason_of
+from service.acquisition import Say, Scan
+from service.endings import reason_of
 from service.live_storage import SEGMENT, FrameRing, LiveStorage, Recording, ring_slots
 from service.pipe import AcquireLive, Ended, Kept, LiveBegan, Need, Shot, Taken
 from service.scan_setup import OpenRig

@@ -195,8 +195,9 @@ def read_command(stream: BinaryIO) -> Command | None:
     head = stream.read(4)
     if len(head) < 4:
         return None
-    data = stream.read(int.from_bytes(head, "little"))
-    return _commands.decode(data)
+    length = int.from_bytes(head, "little")
+    data = stream.read(length)
+    return _commands.decode(data) if len(data) == length else None
 
 
 async def read_report(stream: asyncio.StreamReader) -> Report | None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import shutil
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
@@ -16,20 +15,20 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from scanner.errors import ConfigError, DeviceError, ScannerError, StorageError, SyncError
+from scanner.errors import ScannerError, StorageError
 from scanner.stream import DecodedNote, LiveCounts, Progress, Result
-from scanner.wire import ErrorBody, LiveStart, Refused, ScanStart, error_from_body
+from scanner.wire import LiveStart, Refused, ScanStart
+from service.deliveries import WorkerLost
 from service.devices_link import DevicesLink
+from service.endings import error_of, reason_to_fail
 from service.jobs import Job, JobState, JobStore
-from service.pipe import Ended, Frames, Kept, LiveBegan, Need, Shot
+from service.pipe import Ended, Need
+from service.scan_hearing import ScanHearing
 from service.series import Series, capture_state, missing_patterns
 from service.spool import Spool, empty_trash
-from service.worker_pool import WorkerLost, WorkerPool
+from service.worker_pool import WorkerPool
 
 MAX_QUEUED = 256
-FRAME_EVENT_S = 0.05
-"""Events of captured frames are told at most this often, and for the last frame."""
-
 SWEEP_S = 600.0
 
 _T = TypeVar("_T")
@@ -92,6 +91,9 @@ class Pipeline:
         """
         job = self.store.find(params, client)
         if job is not None:
+            await self.on_disk(lambda: None)  # its record may still be on its way there
+            job = self.store.find(params, client)  # forgotten, where it could not be written
+        if job is not None:
             return job
         if len(self._queue) >= MAX_QUEUED:
             raise Refused(f"{MAX_QUEUED} scans wait already", reason="queue_full", hint="ask again later")
@@ -118,10 +120,19 @@ class Pipeline:
         await self.end(job, JobState.CANCELLED, reason="cancelled")
 
     async def acknowledge(self, job: Job) -> None:
-        """Its client has what it needs."""
-        if not job.acknowledged:
-            job.acknowledged = True
+        """Its client has what it needs.
+
+        Raises:
+            StorageError: that cannot be recorded; it is not acknowledged.
+        """
+        if job.acknowledged:
+            return
+        job.acknowledged = True
+        try:
             await self.save(job)
+        except StorageError:
+            job.acknowledged = False
+            raise
 
     async def delete(self, job: Job) -> None:
         """Delete a job's files now.
@@ -161,10 +172,10 @@ class Pipeline:
     async def _acquire(self, job: Job) -> None:
         job.become(JobState.ACQUIRING)
         # Its record has been on disk since it was asked for; what the capture folder says goes before this state.
-        self.spawn(self.save(job))
+        self.spawn(self._note(job))
         self.tell(job, "started")
         folder = self.spool.capture(job.id)
-        ending = await self._devices.acquire(job.id, folder, job.params, _Listener(self, job))
+        ending = await self._devices.acquire(job.id, folder, job.params, ScanHearing(self, job))
         self.spawn(self._acquired(job, ending))  # the disk may still be busy with it when the next scan begins
 
     async def _acquired(self, job: Job, ending: Awaitable[Ended]) -> None:
@@ -174,7 +185,9 @@ class Pipeline:
             return
         if ended.reason == "completed" and series is not None:
             job.become(JobState.ACQUIRED)
-            await self.save(job)
+            await self._note(job)
+            if job.state is JobState.CANCELLED:  # meanwhile
+                return
             fields = {"reason": ended.reason, "missing": ended.missing, **ended.report}
             self.tell(job, "acquired", fields)
             series.finish("completed", tuple(ended.missing))
@@ -205,17 +218,10 @@ class Pipeline:
         """A job's capture folder is there: a worker may begin."""
         self._follow(job, self._new_series(job))
 
-    def frames(self, job: Job, frames: Frames, told: float) -> float:
-        """More frames of a job; returns when the last event about it went out."""
-        retakes = frames.retakes
-        job.captured = frames.captured
+    def grew(self, job: Job) -> None:
+        """More of a job's frames are on disk."""
         if (series := self._series.get(job.id)) is not None:
             series.grew()
-        now = time.monotonic()
-        if now - told < FRAME_EVENT_S and frames.captured < job.total:
-            return told
-        self.tell(job, "retake" if frames.captured == job.total and retakes else "frame", _counts(frames, job.total))
-        return now
 
     # --- decoding -----------------------------------------------------------------------------------------------
 
@@ -262,7 +268,7 @@ class Pipeline:
         job.files, job.report, job.stage = tuple(result.files), result.report, ""
         reason = job.reason or "completed"
         await self.end(job, JobState.DONE, reason=reason)
-        await self.on_disk(_remove_other_outputs, series, job.output)
+        await self.on_disk(series.remove_outputs, job.output)
 
     def _hear(self, job: Job, message: Progress | DecodedNote | LiveCounts) -> None:
         if job.state.over or isinstance(message, LiveCounts):
@@ -272,6 +278,8 @@ class Pipeline:
             if job.state is JobState.ACQUIRED:
                 job.become(JobState.DECODING)
             self.tell(job, "decoding", {"stage": message.stage})
+            return
+        if job.state not in (JobState.ACQUIRED, JobState.DECODING):
             return
         job.files, job.report = tuple(message.files), message.report
         job.become(JobState.DECODED)
@@ -283,7 +291,7 @@ class Pipeline:
         job.files = ()
         if job.state in (JobState.DECODING, JobState.DECODED):
             job.become(JobState.ACQUIRED)
-        self.spawn(self.save(job))
+        self.spawn(self._note(job))
 
     # --- after a restart ----------------------------------------------------------------------------------------
 
@@ -304,7 +312,9 @@ class Pipeline:
             job.reason = "daemon_restarted"
         missing = missing_patterns(capture, count)
         job.total, job.captured = count, count - len(missing)
-        await self.save(job)
+        await self._note(job)
+        if job.state is JobState.CANCELLED:  # meanwhile
+            return
         series = self._new_series(job)
         series.finish("completed" if state == "complete" else "daemon_restarted", missing)
         self.tell(job, "acquired", {"reason": job.reason or "completed", "missing": list(missing)})
@@ -317,10 +327,7 @@ class Pipeline:
         if job.state.over:
             return
         job.become(state, reason=reason, error=error)
-        try:
-            await self.save(job)
-        except StorageError as problem:
-            _log.error("job %s is %s, which cannot be recorded: %s", job.id, state, problem)
+        await self._note(job)
         fields: dict[str, Any] = {"reason": job.reason}
         if state is JobState.DONE:
             fields["files"] = msgspec.to_builtins(job.files)
@@ -337,16 +344,28 @@ class Pipeline:
         """Write a job's record."""
         await self.on_disk(self.store.write, job.id, job.record())
 
+    async def _note(self, job: Job) -> None:
+        """Write a job's record where it may stay behind: capture folder and older record are enough for a restart."""
+        try:
+            await self.save(job)
+        except StorageError as problem:
+            _log.error("job %s is %s, which cannot be recorded: %s", job.id, job.state, problem)
+
     async def on_disk(self, function: Callable[..., _T], *arguments: Any) -> _T:
         """Call in the one thread that changes records and spool."""
         return await asyncio.get_running_loop().run_in_executor(self._disk, function, *arguments)
 
     async def _sweep(self) -> None:
         while True:
-            for job in await self.on_disk(self.spool.sweep, list(self.store)):
-                await self.save(job)
-                self._publish("spool.deleted", job.id, {})
-            await self.on_disk(self.store.expire, lambda job: not job.deleted and self.spool.folder(job.id).exists())
+            try:
+                for job in await self.on_disk(self.spool.sweep, list(self.store)):
+                    await self._note(job)
+                    self._publish("spool.deleted", job.id, {})
+                await self.on_disk(
+                    self.store.expire, lambda job: not job.deleted and self.spool.folder(job.id).exists()
+                )
+            except StorageError as problem:
+                _log.error("old scans cannot be deleted now: %s", problem)
             await asyncio.sleep(SWEEP_S)
 
     def spawn(self, coroutine: Any) -> None:
@@ -359,57 +378,3 @@ class Pipeline:
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             _log.error("a task of the pipeline failed", exc_info=error)
-
-
-class _Listener:
-    """What hears of one scan on the devices."""
-
-    def __init__(self, pipeline: Pipeline, job: Job) -> None:
-        self._pipeline = pipeline
-        self._job = job
-        self._told = 0.0
-
-    async def need(self, need: Need) -> None:
-        await self._pipeline.room_for(self._job, need)
-
-    def began(self) -> None:
-        self._pipeline.began(self._job)
-
-    def frames(self, frames: Frames) -> None:
-        self._told = self._pipeline.frames(self._job, frames, self._told)
-
-    def live(self, report: LiveBegan | Shot | Kept) -> None:
-        raise AssertionError(f"a scan says no {type(report).__name__}")
-
-
-def _counts(frames: Frames, total: int) -> dict[str, Any]:
-    return {"captured": frames.captured, "total": total, "retakes": frames.retakes}
-
-
-def error_of(ended: Ended) -> ScannerError:
-    """Why the devices ended a run."""
-    if isinstance(ended.error, ErrorBody):
-        return error_from_body(ended.error)
-    return ScannerError(f"the scan ended: {ended.reason}")
-
-
-def reason_to_fail(error: ScannerError) -> str:
-    """A word for programs."""
-    match error:
-        case SyncError():
-            return "sync_lost"
-        case StorageError():
-            return "disk_full"
-        case DeviceError():
-            return "device_lost"
-        case ConfigError():
-            return "refused"
-        case _:
-            return "decode_failed"
-
-
-def _remove_other_outputs(series: Series, kept: str | None) -> None:
-    """What dead deliveries wrote."""
-    for folder in series.outputs.glob("scan-*"):
-        if folder.name != kept:
-            shutil.rmtree(folder, ignore_errors=True)

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from scanner.errors import StorageError
+from scanner.storage import storage_errors
 from scanner.stream import DecodedNote, EndReason, Frame, LiveCounts, Progress, Result
 
 HEADER = "capture.json"
@@ -64,6 +66,12 @@ class Series:
         """Where a delivery's worker writes the scan."""
         return self.outputs / f"scan-{delivery}"
 
+    def remove_outputs(self, kept: str | None) -> None:
+        """Delete what dead deliveries wrote."""
+        for folder in self.outputs.glob("scan-*"):
+            if folder.name != kept:
+                shutil.rmtree(folder, ignore_errors=True)
+
 
 class RecordTail:
     """Reads frames.jsonl while it grows, as `frame` messages."""
@@ -86,10 +94,17 @@ class RecordTail:
             raise StorageError(f"{capture} is not a capture that can be sent: {error}") from error
 
     def read(self, limit: int) -> Iterator[Frame]:
-        """The next whole lines, at most `limit`."""
-        self._records.seek(self._position)
-        for _ in range(limit):
-            line = self._records.readline()
+        """The frames of the next whole lines, at most `limit`. Fewer: there are no more lines yet.
+
+        Raises:
+            StorageError: the disk failed.
+        """
+        upto = self.sent + limit
+        with storage_errors(self._path):
+            self._records.seek(self._position)
+        while self.sent < upto:
+            with storage_errors(self._path):
+                line = self._records.readline()
             if not line.endswith(b"\n"):
                 return  # still being written, or torn by a crash: either way it does not exist
             self._position += len(line)

@@ -122,11 +122,11 @@ class Spool:
             StorageError: the folder cannot be changed.
         """
         folder, trash = self.folder(job.id), self.root / f"{_TRASH}{job.id}"
-        job.deleted = True
-        self._leases.pop(job.id, None)
         with storage_errors(folder):
             if folder.exists():
                 folder.rename(trash)
+        job.deleted = True
+        self._leases.pop(job.id, None)
         _log.info("files of job %s deleted", job.id)
         return trash
 

@@ -13,7 +13,6 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any, cast
 
 import msgspec
@@ -42,6 +41,7 @@ from scanner.stream import (
 )
 from scanner.wire import PROTOCOL, error_from_body
 from service.children import Child
+from service.deliveries import Delivery, Seat, WorkerLost
 from service.jobs import MAX_DELIVERIES
 from service.live_series import LiveSeries
 from service.series import RecordTail, Series
@@ -55,42 +55,6 @@ STEADY_S = 5.0
 _log = logging.getLogger(__name__)
 _encoder = msgspec.msgpack.Encoder()
 Publish = Callable[[str, str | None, Mapping[str, Any]], None]
-
-
-@dataclass
-class Delivery:
-    """One sending of a series to one worker. Its number is never used again."""
-
-    number: int
-    series: Series | LiveSeries
-    acked: int = 0
-    wake: asyncio.Event = field(default_factory=asyncio.Event)
-    sender: asyncio.Task[None] | None = None
-
-
-@dataclass
-class Seat:
-    """One worker that is there."""
-
-    identity: bytes
-    ready: Ready
-    heard: float
-    delivery: Delivery | None = None
-    releasing: int | None = None
-    """a delivery that it was told to let go"""
-
-    @property
-    def free(self) -> bool:
-        """Whether it can take a series."""
-        return self.delivery is None and self.releasing is None
-
-
-class WorkerLost(Exception):
-    """A series was sent as often as it may be, and no worker survived it. `error` is for its client."""
-
-    def __init__(self, error: DecodeError) -> None:
-        super().__init__(error.message)
-        self.error = error
 
 
 class WorkerPool:
@@ -142,8 +106,7 @@ class WorkerPool:
         for seat in self._seats.values():
             if seat.delivery is not None and seat.delivery.series is series:
                 self._stop_sender(seat.delivery)
-                seat.releasing, seat.delivery = seat.delivery.number, None
-                self._send(seat, Cancel(seat.releasing))
+                self._release(seat, seat.delivery)
         if not series.outcome.done():
             series.outcome.cancel()
 
@@ -180,14 +143,20 @@ class WorkerPool:
     async def _keep_worker(self) -> None:
         pause = 0.1
         while not self._closing:
-            child = await Child.start("service.worker", self._command_line, inherit=self._inherit)
-            self._children[child.pid] = child
             began = time.monotonic()
-            status = await child.wait()
-            del self._children[child.pid]
-            self._died(child.pid, status)
+            try:
+                await self._one_worker()
+            except OSError as error:
+                _log.error("a worker cannot be started: %s", error.strerror)
             pause = 0.1 if time.monotonic() - began > STEADY_S else min(2 * pause, RESPAWN_MAX_S)
             await asyncio.sleep(pause)
+
+    async def _one_worker(self) -> None:
+        child = await Child.start("service.worker", self._command_line, inherit=self._inherit)
+        self._children[child.pid] = child
+        status = await child.wait()
+        del self._children[child.pid]
+        self._died(child.pid, status)
 
     def _died(self, pid: int, status: int) -> None:
         _log.warning("worker %d ended with status %d", pid, status)
@@ -259,6 +228,10 @@ class WorkerPool:
         if ready.protocol[0] != PROTOCOL[0]:
             _log.error("worker %s speaks protocol %s: refused", ready.worker, ready.protocol)
             self._send_to(identity, Stop())
+            return
+        if (known := self._seats.get(identity)) is not None:
+            # It was asked who it is more than once, by words it had said before it was known. What it has, it keeps.
+            known.heard = time.monotonic()
             return
         seat = self._seats[identity] = Seat(identity, ready, time.monotonic())
         if ready.busy is not None:  # with something of an earlier daemon
@@ -336,13 +309,15 @@ class WorkerPool:
             await series.changed.wait()
 
     async def _send_series(self, seat: Seat, delivery: Delivery) -> None:
-        series = cast(Series, delivery.series)
         try:
-            tail = RecordTail(series.capture, delivery.number)
+            await self._send_frames(seat, delivery, cast(Series, delivery.series))
         except StorageError as error:
-            seat.delivery = None
-            series.outcome.set_exception(error)
-            return
+            self._release(seat, delivery)
+            if not delivery.series.outcome.done():
+                delivery.series.outcome.set_exception(error)
+
+    async def _send_frames(self, seat: Seat, delivery: Delivery, series: Series) -> None:
+        tail = RecordTail(series.capture, delivery.number)
         try:
             start = Start(
                 delivery.number,
@@ -383,6 +358,11 @@ class WorkerPool:
     def _send_to(self, identity: bytes, message: ToWorker) -> bool:
         """Send if it does not block; whether it went. A worker that cannot be reached is found out by its silence."""
         return send_now(self._router, [identity, _encoder.encode(message)])
+
+    def _release(self, seat: Seat, delivery: Delivery) -> None:
+        """Have a worker let a series go; it is free again when it says so."""
+        seat.releasing, seat.delivery = delivery.number, None
+        self._send(seat, Cancel(delivery.number))
 
     def _stop_sender(self, delivery: Delivery) -> None:
         if delivery.sender is not None:

@@ -104,8 +104,10 @@ class CaptureWriter:
         Raises:
             StorageError: the disk is full or failed.
         """
+        line = (json.dumps(record.as_dict(), separators=(",", ":")) + "\n").encode()
         with storage_errors(self.folder / RECORDS_FILE):
-            os.write(self._records, (json.dumps(record.as_dict(), separators=(",", ":")) + "\n").encode())
+            while line:  # the last bytes of a disk take part of a line: the next attempt says that it is full
+                line = line[os.write(self._records, line) :]
 
     def sync(self) -> None:
         """Make all that was written so far last: fdatasync of pixels, then of lines."""

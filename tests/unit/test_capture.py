@@ -139,6 +139,17 @@ def test_a_full_disk_is_found_before_the_run(tmp_path: Path, monkeypatch: pytest
     assert not list((tmp_path / "c").iterdir())
 
 
+def test_a_line_that_the_disk_takes_in_two_pieces_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    writer = CaptureWriter(tmp_path / "c", header(), 5)
+    write = os.write
+    monkeypatch.setattr(os, "write", lambda file, data: write(file, data[: max(1, len(data) // 2)]))
+    writer.record(FrameRecord(None, 3, status="missing"))
+    writer.record(FrameRecord(None, 4, status="missing"))
+    writer.abandon()
+    lines = (tmp_path / "c" / "frames.jsonl").read_text().splitlines()
+    assert [json.loads(line)["pattern"] for line in lines] == [3, 4]
+
+
 def test_a_folder_with_a_capture_is_refused(tmp_path: Path) -> None:
     CaptureWriter(tmp_path / "c", header(), 1).abandon()
     with pytest.raises(StorageError, match="holds a capture already"):

@@ -86,8 +86,10 @@ def test_a_damaged_record_is_left_alone(tmp_path: Path, caplog: pytest.LogCaptur
     made(JobStore(tmp_path))
     (tmp_path / "aaaa.json").write_text("{")
     (tmp_path / f"{uuid.uuid4()}.json").write_text(json.dumps({"format": "fringed-job", "version": 2}))
+    odd = {**json.loads((tmp_path / f"{ID}.json").read_bytes()), "id": 7}
+    (tmp_path / f"{uuid.uuid4()}.json").write_text(json.dumps(odd))
     assert [job.id for job in JobStore(tmp_path)] == [ID]
-    assert len([record for record in caplog.records if "left alone" in record.message]) == 2
+    assert len([record for record in caplog.records if "left alone" in record.message]) == 3
     assert (tmp_path / "aaaa.json").exists()
 
 
