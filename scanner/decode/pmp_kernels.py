@@ -1,9 +1,9 @@
 """The pass of PMP decoding over pixels: all frames of one axis to coordinates, in one go and in cache.
 
 Frames are given by the addresses of their pixels, so that they may lie anywhere: in memory, or in the map of a file.
-Work goes through the image in tiles. A tile's samples are read once, four frames at a time; sums, phases, fringe
-orders and the verdict follow while it is in the cache, in loops over few arrays that the compiler turns into vector
-instructions. What a pixel's noise is, and how the ladder of beats climbs, is decided by the caller.
+Work goes through the image in tiles. A tile's samples are read once; sums, phases, fringe orders and the verdict follow
+while it is in the cache, in four loops over vectors of pixels (`scanner.lanes`): longer ones would wait for their own
+results. What a pixel's noise is, and how the ladder of beats climbs, is decided by the caller.
 """
 
 from __future__ import annotations
@@ -14,9 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode.addresses import aligned_rows
-from scanner.decode.pmp_sums import SUMS, TILE, fit_tile
+from scanner.decode.pmp_sums import TILE, fit_tile
 from scanner.decode.reasons import count_reasons
 from scanner.kernel import contracting_kernel
+from scanner.lanes import (
+    LANES,
+    any_of,
+    choose,
+    floats,
+    greatest,
+    load,
+    magnitude,
+    nearest,
+    power_of_two,
+    root,
+    store,
+    whole,
+)
 
 _F0 = np.float32(0)
 _F1 = np.float32(1)
@@ -42,7 +56,7 @@ def decode_pixels(
     starts: NDArray[np.intp],
     weights: NDArray[np.float32],
     grams: NDArray[np.float32],
-    whole: NDArray[np.intp],
+    shifts: NDArray[np.intp],
     clip: int,
     gains: NDArray[np.float32],
     rungs: NDArray[np.float32],
@@ -73,7 +87,7 @@ def decode_pixels(
             its first frame. like: (0,) array of the frames' dtype, uint8 or uint16.
         starts: (K + 1,) where each set begins in `addresses`. weights: (3, F) float32, least-squares weights of A, p, q
             in I_n = A + p cos(alpha_n) - q sin(alpha_n); 0 for padding. grams: (K, 6) float32, of the normal matrix
-            g00, g11, g22, 2 g01, 2 g02, 2 g12. whole: (K,) shifts of sets that have all of their 4 or 8, else 0.
+            g00, g11, g22, 2 g01, 2 g02, 2 g12. shifts: (K,) of sets that have all of their 4 or 8, else 0.
         clip: grey level from which a sample counts as saturated.
         gains: (K,) float32, variance of (p, q) over that of one sample.
         rungs: (J, K) float32 combinations. ratios: (J - 1,). errors: (J - 1, K): squared error weights.
@@ -87,176 +101,76 @@ def decode_pixels(
         position, sigma, confidence, albedo, modulation: (P,) float32, written. reason: (P,) uint8, written.
         counts: (REASONS,) int64, how many pixels have each reason, is added to.
     """
-    sets = gains.size
-    work = aligned_rows(3 * sets + SUMS + 10, TILE)
-    phases, squares, inverses = work[:sets], work[sets : 2 * sets], work[2 * sets : 3 * sets]
-    sums, danger = work[3 * sets : -10], work[-10:-7]
-    mean, residual, variance, lit, absolute, beat, spread = (
-        work[-7],
-        work[-6],
-        work[-5],
-        work[-4],
-        work[-3],
-        work[-2],
-        work[-1],
-    )
-    top = np.empty(TILE, like.dtype)
+    sets, steps = gains.size, ratios.size
+    # Behind the fit's rows: variance, lit sets, absolute phase, probability of a wrong order; then what the ladder
+    # combines of sets: a beat for each rung, an error for each step.
+    rows = aligned_rows(3 * sets + 7 + 2 * steps + 1, TILE)
+    fit, rest = rows[: 3 * sets + 3], rows[3 * sets + 3 : 3 * sets + 7]
+    first_beat, first_spread = 3 * sets + 7, 3 * sets + 8 + steps
+    beats, terms, parts = _plan(rungs, errors, gains, first_beat, first_spread, 2 * sets)
+    last = aligned_rows(5, TILE)
+    last_reason = np.empty(TILE, np.uint8)
     for at in range(begin, end, TILE):
         size = min(TILE, end - at)
-        fit_tile(
-            addresses,
-            like,
-            starts,
-            weights,
-            grams,
-            whole,
-            at,
-            size,
-            sums,
-            phases,
-            squares,
-            inverses,
-            mean,
-            residual,
-            top,
-        )
-        _noise_of(mean, residual, noise, size, variance, lit, danger)
-        for k in range(sets):
-            # From here on `inverses` is the phase's variance, in cycles squared.
-            _errors_of(squares[k], inverses[k], variance, gains[k], limits[0], limits[1], size, lit)
-        _combine(phases, rungs[0], size, absolute)
-        _fold(absolute, scale[2], size)
-        for j in range(ratios.size):
-            _spread(inverses, errors[j], floors[j], size, spread)
-            single = _only(rungs[j + 1])
-            if single >= 0:
-                _step(absolute, phases[single], spread, ratios[j], limits[4], size, danger)
-            else:
-                _combine(phases, rungs[j + 1], size, beat)
-                _step(absolute, beat, spread, ratios[j], limits[4], size, danger)
-        _doubt(danger, ratios.size, size)
-        _judge(
-            absolute, squares[finest], inverses[finest], mean, residual, lit, top, danger[0],
-            sets, clip, noise, scale, limits, periodic, size,
-            position[at : at + size], sigma[at : at + size], confidence[at : at + size],
-            albedo[at : at + size], modulation[at : at + size], reason[at : at + size],
-        )  # fmt: skip
+        blocks = -(-size // LANES) * LANES
+        fit_tile(addresses, like, starts, weights, grams, shifts, at, size, at + size < end, fit)
+        if _noise_of(fit, gains, noise, limits, blocks, rest[0], rest[1]):
+            _combine_rungs(rows, rungs, errors, gains, beats, terms, first_beat, first_spread, blocks)
+            _climb(rows.reshape(-1), beats, terms, parts, ratios, floors, scale[2], limits[4], blocks, rest)
+        if blocks == size:
+            _judge(
+                fit, rest, finest, gains, clip, noise, scale, limits, periodic, blocks,
+                position[at : at + size], sigma[at : at + size], confidence[at : at + size],
+                albedo[at : at + size], modulation[at : at + size], reason[at : at + size],
+            )  # fmt: skip
+        else:
+            _judge(
+                fit, rest, finest, gains, clip, noise, scale, limits, periodic, blocks,
+                last[0], last[1], last[2], last[3], last[4], last_reason,
+            )  # fmt: skip
+            position[at : at + size], sigma[at : at + size] = last[0, :size], last[1, :size]
+            confidence[at : at + size] = last[2, :size]
+            albedo[at : at + size], modulation[at : at + size] = last[3, :size], last[4, :size]
+            reason[at : at + size] = last_reason[:size]
         count_reasons(reason[at : at + size], counts)
 
 
-# --- fringe orders ----------------------------------------------------------------------------------------------------
+# --- the ladder as rows -----------------------------------------------------------------------------------------------
 
 
 @contracting_kernel
-def _noise_of(
-    mean: NDArray[np.float32],
-    residual: NDArray[np.float32],
-    noise: NDArray[np.float32],
-    size: int,
-    variance: NDArray[np.float32],
-    lit: NDArray[np.float32],
-    danger: NDArray[np.float32],
-) -> None:
-    v0, slope, least, prior, shrink = noise[0], noise[1], noise[2], noise[3], noise[4]
-    for i in range(size):
-        model = max(v0 + slope * mean[i], least)
-        # A residual can show a pixel to be noisier than the model has it; a small one is luck more often than not.
-        variance[i] = max((prior * model + residual[i]) * shrink, model)
-        lit[i] = _F0
-        danger[0, i] = _HUGE
-        danger[1, i] = _F1
-        danger[2, i] = -_F1
-
-
-@contracting_kernel
-def _errors_of(
-    squares: NDArray[np.float32],
-    inverses: NDArray[np.float32],
-    variance: NDArray[np.float32],
-    gain: np.float32,
-    min_b: np.float32,
-    min_snr2: np.float32,
-    size: int,
-    lit: NDArray[np.float32],
-) -> None:
-    min_b2, per_b2 = min_b * min_b, gain * _PER_TURN2
-    for i in range(size):
-        noise_b2 = gain * variance[i]
-        lit[i] += _F1 if squares[i] >= max(min_b2, min_snr2 * noise_b2) else _F0
-        inverses[i] *= per_b2 * variance[i]
-
-
-@contracting_kernel
-def _fold(absolute: NDArray[np.float32], centre: np.float32, size: int) -> None:
-    for i in range(size):
-        absolute[i] -= np.rint(absolute[i] - centre)
-
-
-@contracting_kernel
-def _combine(phases: NDArray[np.float32], rung: NDArray[np.float32], size: int, total: NDArray[np.float32]) -> None:
-    first = True
-    for k in range(rung.size):
-        weight = rung[k]
-        if weight != _F0:
-            phase = phases[k]
-            if first:
-                for i in range(size):
-                    total[i] = weight * phase[i]
-            else:
-                for i in range(size):
-                    total[i] += weight * phase[i]
-            first = False
-
-
-@contracting_kernel
-def _spread(
-    cycles2: NDArray[np.float32],
+def _plan(
+    rungs: NDArray[np.float32],
     errors: NDArray[np.float32],
-    floor: np.float32,
-    size: int,
-    spread: NDArray[np.float32],
-) -> None:
-    """Variance of a step's remainder: of two sets, as between single sets, in one loop; any more are added."""
-    first, second = -1, -1
-    for k in range(errors.size):
-        if errors[k] != _F0 and first < 0:
-            first = k
-        elif errors[k] != _F0 and second < 0:
-            second = k
-    one, weight = cycles2[first], errors[first]
-    two, other = cycles2[max(second, first)], errors[second] if second >= 0 else _F0
-    for i in range(size):
-        spread[i] = floor + weight * one[i] + other * two[i]
-    for k in range(max(second, first) + 1, errors.size):
-        if errors[k] != _F0:
-            weight, one = errors[k], cycles2[k]
-            for i in range(size):
-                spread[i] += weight * one[i]
+    gains: NDArray[np.float32],
+    first_beat: int,
+    first_spread: int,
+    inverses: int,
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
+    """Which rows the ladder climbs by: (J,) of each rung's phase; (J - 1, 2) of each step's errors, (J - 1, 2) weights.
 
-
-@contracting_kernel
-def _step(
-    absolute: NDArray[np.float32],
-    beat: NDArray[np.float32],
-    spread: NDArray[np.float32],
-    ratio: np.float32,
-    max_remainder2: np.float32,
-    size: int,
-    danger: NDArray[np.float32],
-) -> None:
-    """One rung up. `danger` remembers the step that was nearest to the neighbouring order, and the worst remainder."""
-    for i in range(size):
-        difference = ratio * absolute[i] - beat[i]
-        order = np.rint(difference)
-        remainder = difference - order
-        variance = spread[i]
-        margin = _F1 - _F2 * abs(remainder)
-        # margin / variance < the least so far, without a division
-        nearer = margin * danger[1, i] < danger[0, i] * variance
-        danger[0, i] = margin if nearer else danger[0, i]
-        danger[1, i] = variance if nearer else danger[1, i]
-        danger[2, i] = max(danger[2, i], remainder * remainder - max_remainder2 * variance)
-        absolute[i] = beat[i] + order
+    A rung that is one set is that set's phase, and an error of two sets is made up of theirs; others are combined in
+    rows of their own before.
+    """
+    steps, sets = errors.shape
+    beats = np.empty(steps + 1, np.intp)
+    terms = np.full((steps, 2), inverses)
+    parts = np.zeros((steps, 2), np.float32)
+    for j in range(steps + 1):
+        single = _only(rungs[j])
+        beats[j] = single if single >= 0 else first_beat + j
+    for j in range(steps):
+        count = 0
+        for k in range(sets):
+            if errors[j, k] != _F0:
+                if count < 2:
+                    terms[j, count] = inverses + k
+                    parts[j, count] = errors[j, k] * gains[k] * _PER_TURN2
+                count += 1
+        if count > 2:
+            terms[j, 0], parts[j, 0] = first_spread + j, _F1
+            terms[j, 1], parts[j, 1] = first_spread + j, _F0
+    return beats, terms, parts
 
 
 @contracting_kernel
@@ -272,31 +186,124 @@ def _only(rung: NDArray[np.float32]) -> int:
 
 
 @contracting_kernel
-def _doubt(danger: NDArray[np.float32], steps: int, size: int) -> None:
-    """Probability that an order is wrong, into danger[0]."""
+def _combine_rungs(
+    rows: NDArray[np.float32],
+    rungs: NDArray[np.float32],
+    errors: NDArray[np.float32],
+    gains: NDArray[np.float32],
+    beats: NDArray[np.intp],
+    terms: NDArray[np.intp],
+    first_beat: int,
+    first_spread: int,
+    size: int,
+) -> None:
+    sets = gains.size
+    for j in range(beats.size):
+        if beats[j] == first_beat + j:
+            _combine(rows[:sets], rungs[j], size, rows[beats[j]])
+    for j in range(terms.shape[0]):
+        if terms[j, 0] == first_spread + j:
+            _combine(rows[2 * sets : 3 * sets], errors[j] * gains * _PER_TURN2, size, rows[terms[j, 0]])
+
+
+@contracting_kernel
+def _combine(values: NDArray[np.float32], weights: NDArray[np.float32], size: int, total: NDArray[np.float32]) -> None:
+    for i in range(0, size, LANES):
+        store(total, i, floats(_F0))
+    for k in range(weights.size):
+        weight, row = weights[k], values[k]
+        if weight != _F0:
+            for i in range(0, size, LANES):
+                store(total, i, load(total, i) + weight * load(row, i))
+
+
+# --- fringe orders ----------------------------------------------------------------------------------------------------
+
+
+@contracting_kernel
+def _noise_of(
+    fit: NDArray[np.float32],
+    gains: NDArray[np.float32],
+    noise: NDArray[np.float32],
+    limits: NDArray[np.float32],
+    size: int,
+    variance: NDArray[np.float32],
+    lit: NDArray[np.float32],
+) -> bool:
+    """Variance of a sample, and how many sets have enough modulation; whether any pixel has it in all of them."""
+    v0, slope, least, prior, shrink = noise[0], noise[1], noise[2], noise[3], noise[4]
+    sets = gains.size
+    mean, residual = fit[3 * sets], fit[3 * sets + 1]
+    for i in range(0, size, LANES):
+        model = greatest(v0 + slope * load(mean, i), least)
+        # A residual can show a pixel to be noisier than the model has it; a small one is luck more often than not.
+        store(variance, i, greatest((prior * model + load(residual, i)) * shrink, model))
+        store(lit, i, floats(_F0))
+    min_b2 = limits[0] * limits[0]
+    for k in range(sets):
+        squares, min_per_variance = fit[sets + k], limits[1] * gains[k]
+        for i in range(0, size, LANES):
+            enough = load(squares, i) >= greatest(min_per_variance * load(variance, i), min_b2)
+            store(lit, i, load(lit, i) + choose(enough, _F1, _F0))
+    all_lit, most = np.float32(sets) - _HALF, floats(_F0)
+    for i in range(0, size, LANES):
+        most = greatest(most, load(lit, i))
+    return any_of(most > all_lit)
+
+
+@contracting_kernel
+def _climb(
+    rows: NDArray[np.float32],
+    beats: NDArray[np.intp],
+    terms: NDArray[np.intp],
+    parts: NDArray[np.float32],
+    ratios: NDArray[np.float32],
+    floors: NDArray[np.float32],
+    centre: np.float32,
+    max_remainder2: np.float32,
+    size: int,
+    rest: NDArray[np.float32],
+) -> None:
+    """Up the ladder: the finest rung's absolute phase, and the probability that an order is wrong."""
+    variances, out, wrong = rest[0], rest[2], rest[3]
+    steps = ratios.size
     count = np.float32(steps)
-    for i in range(size):
+    beats_at, terms_at = beats * TILE, terms * TILE
+    for i in range(0, size, LANES):
+        variance = load(variances, i)
+        absolute = load(rows, beats_at[0] + i)
+        absolute -= nearest(absolute - centre)
+        # The step that came nearest to the neighbouring order, and by what sigma; the worst remainder.
+        margin, spread, worst = floats(_HUGE), floats(_F1), floats(-_F1)
+        for j in range(steps):
+            own = parts[j, 0] * load(rows, terms_at[j, 0] + i) + parts[j, 1] * load(rows, terms_at[j, 1] + i)
+            error2 = variance * own + floors[j]
+            beat = load(rows, beats_at[j + 1] + i)
+            difference = ratios[j] * absolute - beat
+            order = nearest(difference)
+            remainder = difference - order
+            absolute = beat + order
+            room = _F1 - _F2 * magnitude(remainder)
+            # room / error2 < the least so far, without a division
+            nearer = room * spread < margin * error2
+            margin, spread = choose(nearer, room, margin), choose(nearer, error2, spread)
+            worst = greatest(worst, remainder * remainder - max_remainder2 * error2)
+        store(out, i, absolute)
         # Odds of the neighbouring order against the nearest, for a normal error: exp(-(1 - 2 |r|) / (2 sigma^2)).
         # The step in most danger stands for all.
-        power = max(danger[0, i] / danger[1, i] * _LOG2_E_HALF, _LEAST_POWER)
-        exponent = np.rint(power)
+        power = greatest(margin / spread * _LOG2_E_HALF, _LEAST_POWER)
+        exponent = nearest(power)
         x = power - exponent
-        odds = _F1 + x * (_P1 + x * (_P2 + x * (_P3 + x * _P4)))
-        odds *= np.int32((np.int32(exponent) + np.int32(127)) << np.int32(23)).view(np.float32)
-        danger[0, i] = _F1 if danger[2, i] > _F0 else count * odds
+        odds = (_F1 + x * (_P1 + x * (_P2 + x * (_P3 + x * _P4)))) * power_of_two(whole(exponent))
+        store(wrong, i, choose(worst > _F0, _F1, count * odds))
 
 
 @contracting_kernel
 def _judge(
-    absolute: NDArray[np.float32],
-    finest2: NDArray[np.float32],
-    finest_error2: NDArray[np.float32],
-    mean: NDArray[np.float32],
-    residual: NDArray[np.float32],
-    lit: NDArray[np.float32],
-    top: NDArray[Any],
-    wrong: NDArray[np.float32],
-    sets: int,
+    fit: NDArray[np.float32],
+    rest: NDArray[np.float32],
+    finest: int,
+    gains: NDArray[np.float32],
     clip: int,
     noise: NDArray[np.float32],
     scale: NDArray[np.float32],
@@ -311,41 +318,45 @@ def _judge(
     reason: NDArray[np.uint8],
 ) -> None:
     """Coordinate, sigma, confidence and reason of every pixel of a tile."""
-    v0, slope, least, prior, shrink = noise[0], noise[1], noise[2], noise[3], noise[4]
-    along, origin, fine, low = scale[0], scale[1], scale[3], scale[4]
-    max_excess, max_share, max_wrong, edge = limits[2], limits[3], limits[5], limits[6]
-    freedom = max(_F1 / shrink - prior, _F1)
-    max_excess *= freedom
-    max_share *= freedom
-    per_fringe, per_cycle = along / fine, _F1 / fine
-    whole = _F1 if periodic else _F0
-    side = edge if periodic else -edge
-    all_lit = np.float32(sets) - _HALF
-    for i in range(size):
+    sets = gains.size
+    squares, inverses = fit[sets + finest], fit[2 * sets + finest]
+    means, residuals, tops = fit[3 * sets], fit[3 * sets + 1], fit[3 * sets + 2]
+    variances, lits, absolutes, wrongs = rest[0], rest[1], rest[2], rest[3]
+    v0, slope, least = noise[0], noise[1], noise[2]
+    along, origin, fine, low = scale[0], scale[1], scale[3], scale[4] + _HALF
+    freedom = max(_F1 / noise[4] - noise[3], _F1)
+    max_excess, max_share, max_wrong = limits[2] * freedom, limits[3] * freedom, limits[5]
+    per_cycle, per_fringe2 = _F1 / fine, (along / fine) ** 2 * gains[finest] * _PER_TURN2
+    turn = _F1 if periodic else _F0
+    side = limits[6] if periodic else -limits[6]
+    all_lit, top = np.float32(sets) - _HALF, np.float32(clip)
+    beyond = along - _HALF
+    for i in range(0, size, LANES):
         # Both ends of a periodic field look alike: whole turns are taken off.
-        turns = absolute[i] * per_cycle
-        turns -= whole * np.rint(turns - low - _HALF)
+        turns = load(absolutes, i) * per_cycle
+        turns -= turn * nearest(turns - low)
         value = turns * along - origin
-        deviation = per_fringe * np.sqrt(finest_error2[i])
-        margin = side * deviation
-        inside = (value > margin - _HALF) & (value < along - _HALF - margin)
-        model = max(v0 + slope * mean[i], least)
-        moved = (residual[i] > max_excess * model) & (residual[i] > max_share * finest2[i])
-        why = np.int32(0) if inside else np.int32(5)
-        why = np.int32(4) if wrong[i] > max_wrong else why
-        why = np.int32(3) if lit[i] < all_lit else why
-        why = np.int32(1) if lit[i] < _HALF else why
-        why = np.int32(7) if moved else why
-        why = np.int32(2) if top[i] >= clip else why
-        good = why == np.int32(0)
-        known = good | (why == np.int32(4))
-        position[i] = value if known else _NAN
-        sigma[i] = deviation if known else _NAN
-        confidence[i] = _F1 - wrong[i] if good else _F0
-        reason[i] = np.uint8(why)
-    for i in range(size):
-        albedo[i] = mean[i]
-        modulation[i] = np.sqrt(finest2[i])
+        deviation = root((per_fringe2 * load(variances, i)) * load(inverses, i))
+        wrong, lit, square = load(wrongs, i), load(lits, i), load(squares, i)
+        mean, residual = load(means, i), load(residuals, i)
+        edge = side * deviation - _HALF
+        inside = (value > edge) & (value + edge < beyond - _HALF)
+        model = greatest(v0 + slope * mean, least)
+        moved = (residual > max_excess * model) & (residual > max_share * square)
+        why = choose(inside, 0, 5)
+        why = choose(wrong > max_wrong, 4, why)
+        why = choose(lit > all_lit, why, 3)
+        why = choose(lit < _HALF, 1, why)
+        why = choose(moved, 7, why)
+        why = choose(load(tops, i) >= top, 2, why)
+        good = why < 1
+        known = good | ((why > 3) & (why < 5))
+        store(position, i, choose(known, value, _NAN))
+        store(sigma, i, choose(known, deviation, _NAN))
+        store(confidence, i, choose(good, _F1 - wrong, _F0))
+        store(reason, i, why)
+        store(albedo, i, mean)
+        store(modulation, i, root(square))
 
 
 # --- two axes ---------------------------------------------------------------------------------------------------------

@@ -11,9 +11,11 @@ import pytest
 from scanner.decode import Reason, decoder_for
 from scanner.decode.neighbours import CONFIDENCE, settle
 from scanner.decode.pmp import PmpDecoder, PmpThresholds, warm_up
-from scanner.decode.pmp_sums import ARCTAN_ERROR_CYCLES, TILE, _measure, _turn
+from scanner.decode.pmp_sums import ARCTAN_ERROR_CYCLES, TILE, _phase
 from scanner.decode.strips import in_strips
 from scanner.errors import DecodeError
+from scanner.kernel import contracting_kernel
+from scanner.lanes import LANES, load, store
 from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, PmpPattern, ProjectorSize
 
 PROJECTOR = ProjectorSize(320, 240)
@@ -475,7 +477,7 @@ def test_strips_cover_every_pixel_once():
 
 
 def test_the_arctangent_is_as_good_as_it_says():
-    angle = np.linspace(-np.pi, np.pi, 40_001)
+    angle = np.linspace(-np.pi, np.pi, 1250 * LANES)
     for size in (1e-3, 1.0, 30_000.0):
         frames = [(size * np.cos(angle + 2 * np.pi * n / 3) + 2 * size).astype(np.float32) for n in range(3)]
         p = (2 * frames[0] - frames[1] - frames[2]) / 3
@@ -488,7 +490,12 @@ def test_the_arctangent_is_as_good_as_it_says():
 
 def turns_of(p, q):
     """The kernel's arctangent at given sums."""
-    out = [np.zeros(p.size, np.float32) for _ in range(3)]
-    _measure(p, q, p.size, *out)
-    _turn(p, q, p.size, out[0])
-    return out[0]
+    cycles = np.empty(p.size, np.float32)
+    _turns_of(p, q, cycles)
+    return cycles
+
+
+@contracting_kernel
+def _turns_of(p, q, cycles):
+    for i in range(0, p.size, LANES):
+        store(cycles, i, _phase(load(p, i), load(q, i), np.float32(1))[2])
