@@ -14,11 +14,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.decode.mcp.exponentials import exp_of, log_of
 from scanner.decode.mcp.linking import Chains
 from scanner.decode.mcp.magnification import FIELD_STEP
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.stripes import STEP
-from scanner.kernel import kernel, summing_kernel
+from scanner.kernel import contracting_kernel, kernel, summing_kernel
 
 Array = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -147,6 +148,7 @@ def _fit(
 ) -> None:
     unknowns, size, padded = inverse.shape[1], basis.shape[1], basis.shape[2]
     channels = (unknowns - GROUND) // 2
+    sums = np.empty((4, padded), np.float32)
     right = np.empty(padded, np.float32)
     fitted = np.empty(unknowns, np.float32)
     total_weight = np.float32(0)
@@ -169,20 +171,13 @@ def _fit(
                 bright[k] = bright[j]
                 continue
             previous = begin
-            piece = light[4 * begin : 4 * begin + size]
-            table = basis[pick[k]]
-            energy = np.float32(0)
+            m = pick[k]
             explained = np.float32(0)
-            right[:] = 0
-            for q in range(size):  # samples outside, unknowns inside: the sums run side by side in vector registers
-                value = piece[q]
-                energy += window[q] * value * value
-                for u in range(padded):
-                    right[u] += table[q, u] * value
+            energy = _project(light, 4 * begin, basis, m, window, sums, right)
             for u in range(unknowns):
                 dot = np.float32(0)
                 for v in range(unknowns):
-                    dot += inverse[pick[k], u, v] * right[v]
+                    dot += inverse[m, u, v] * right[v]
                 fitted[u] = dot
                 explained += dot * right[u]
             # The bend's mean over a Hann window, (1 / 3 - 2 / pi^2) of its value at the ends.
@@ -195,8 +190,29 @@ def _fit(
                 c = GROUND + 2 * i
                 a, b = fitted[c], fitted[c + 1]
                 ratio[k, i] = np.sqrt(a * a + b * b) / mean
-                spread = np.float32(0.5) * (inverse[pick[k], c, c] + inverse[pick[k], c + 1, c + 1])
+                spread = np.float32(0.5) * (inverse[m, c, c] + inverse[m, c + 1, c + 1])
                 sigma[k, i] = np.sqrt(variance * spread) / mean * shortness
+
+
+@summing_kernel
+def _project(light: Array, begin: int, basis: Array, m: int, window: Array, sums: Array, right: Array) -> np.float32:
+    """right = basis[m].T @ light from `begin` on; returns the light's weighted square."""
+    size, padded = basis.shape[1], basis.shape[2]
+    energy = np.float32(0)
+    for q in range(size):
+        value = light[begin + q]
+        energy += window[q] * value * value
+    sums[:] = 0
+    # Samples outside, unknowns inside: the sums run side by side in vector registers, and four do not wait for one
+    # another.
+    for q in range(0, size, 4):
+        for j in range(4):
+            value = light[begin + q + j]
+            for u in range(padded):
+                sums[j, u] += basis[m, q + j, u] * value
+    for u in range(padded):
+        right[u] = (sums[0, u] + sums[1, u]) + (sums[2, u] + sums[3, u])
+    return energy
 
 
 def first_modulation(seen: Amplitudes, model: PatternModel) -> Array:
@@ -268,7 +284,20 @@ def log_likelihood(seen: Amplitudes, model: PatternModel, modulation: Array, flo
     count = len(seen.light)
     result = np.zeros((count, model.stripes), np.float32)
     stray = np.zeros(count, np.float32)
-    _likelihood(seen.ratio, seen.sigma, model.ratio, modulation, floor, result, stray)
+    logs = np.empty(count, np.float32)
+    for i in range(model.channels):
+        ratio, noise = np.ascontiguousarray(seen.ratio[:, i]), np.ascontiguousarray(seen.sigma[:, i])
+        own = model.ratio[:, i]
+        # Anything from nothing to half as much again as the strongest, and the noise on top.
+        widest = np.float32(max(1.5 * own.max(), 1e-3))
+        _of_nothing(noise, floor[i], widest, stray)
+        # Few different amplitudes per channel: 2 ("equal") or up to N + 1 ("composite").
+        for value in np.unique(own):
+            if value == 0:
+                _switched_off(ratio, noise, floor[i], widest, logs)
+            else:
+                _switched_on(ratio, noise, floor[i], widest, np.float32(value * modulation[i]), logs)
+            _add(logs, own == value, result)
     dark = model.level == 0
     if dark.any():
         # A stripe without light has no peak: only a stray one could be taken for it.
@@ -276,48 +305,42 @@ def log_likelihood(seen: Amplitudes, model: PatternModel, modulation: Array, flo
     return result, stray
 
 
-@kernel
-def _likelihood(
-    seen: Array, noise: Array, own: Array, modulation: Array, floor: Array, result: Array, stray: Array
+@contracting_kernel
+def _of_nothing(noise: Array, floor: np.float32, widest: np.float32, stray: Array) -> None:
+    """Adds the logarithm of the flat density."""
+    for k in range(len(noise)):
+        sigma = np.sqrt(noise[k] * noise[k] + floor * floor)
+        stray[k] -= log_of(widest + np.float32(2.5) * sigma)
+
+
+@contracting_kernel
+def _switched_off(ratio: Array, noise: Array, floor: np.float32, widest: np.float32, logs: Array) -> None:
+    for k in range(len(ratio)):
+        sigma = np.sqrt(noise[k] * noise[k] + floor * floor)
+        flat = np.float32(1) / (widest + np.float32(2.5) * sigma)
+        inverse = np.float32(1) / sigma
+        z = ratio[k] * inverse
+        density = max(z, np.float32(0.02)) * inverse * exp_of(np.float32(-0.5) * z * z)
+        logs[k] = log_of(np.float32(1 - OUTLIER) * density + np.float32(OUTLIER) * flat)
+
+
+@contracting_kernel
+def _switched_on(
+    ratio: Array, noise: Array, floor: np.float32, widest: np.float32, mean: np.float32, logs: Array
 ) -> None:
-    count, channels = seen.shape
-    stripes = own.shape[0]
-    for i in range(channels):
-        # Few different amplitudes per channel: 2 ("equal") or up to N + 1 ("composite").
-        values = np.empty(stripes, np.float32)
-        index = np.empty(stripes, np.int32)
-        different = 0
-        top = np.float32(0)
-        for s in range(stripes):
-            top = max(top, own[s, i])
-            found = -1
-            for d in range(different):
-                if values[d] == own[s, i]:
-                    found = d
-            if found < 0:
-                values[different] = own[s, i]
-                found = different
-                different += 1
-            index[s] = found
-        widest = max(np.float32(1.5) * top, np.float32(1e-3))
-        logs = np.empty(different, np.float32)
-        for k in range(count):
-            sigma = np.sqrt(noise[k, i] * noise[k, i] + floor[i] * floor[i])
-            r = seen[k, i]
-            # Anything from nothing to half as much again as the strongest, and the noise on top.
-            flat = np.float32(1) / (widest + np.float32(2.5) * sigma)
-            stray[k] += np.log(flat)
-            for d in range(different):
-                if values[d] == 0:
-                    density = r / (sigma * sigma) * np.exp(np.float32(-0.5) * r * r / (sigma * sigma))
-                    density = max(
-                        density, np.float32(0.02) / sigma * np.exp(np.float32(-0.5) * r * r / (sigma * sigma))
-                    )
-                else:
-                    mean = values[d] * modulation[i]
-                    wide = np.sqrt(sigma * sigma + np.float32(SPREAD * SPREAD) * mean * mean)
-                    z = (np.sqrt(mean * mean + sigma * sigma) - r) / wide
-                    density = np.float32(0.39894) / wide * np.exp(np.float32(-0.5) * z * z)
-                logs[d] = np.log(np.float32(1 - OUTLIER) * density + np.float32(OUTLIER) * flat)
-            for s in range(stripes):
-                result[k, s] += logs[index[s]]
+    for k in range(len(ratio)):
+        square = noise[k] * noise[k] + floor * floor
+        flat = np.float32(1) / (widest + np.float32(2.5) * np.sqrt(square))
+        inverse = np.float32(1) / np.sqrt(square + np.float32(SPREAD * SPREAD) * mean * mean)
+        z = (np.sqrt(mean * mean + square) - ratio[k]) * inverse
+        density = np.float32(0.39894) * inverse * exp_of(np.float32(-0.5) * z * z)
+        logs[k] = log_of(np.float32(1 - OUTLIER) * density + np.float32(OUTLIER) * flat)
+
+
+@kernel
+def _add(logs: Array, those: NDArray[np.bool_], result: Array) -> None:
+    """result[k, s] += logs[k] for those s."""
+    for k in range(len(logs)):
+        value = logs[k]
+        for s in range(result.shape[1]):
+            result[k, s] += value if those[s] else np.float32(0)
