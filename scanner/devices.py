@@ -513,6 +513,18 @@ class Truth:
 
 
 @runtime_checkable
+class KnowsTemperature(Protocol):
+    """A camera with a thermometer: geometry moves until it is warm."""
+
+    def temperature_c(self) -> float | None:
+        """Degrees Celsius, now; None where this model has none. Called between runs.
+
+        Raises:
+            DeviceError: it could not be read.
+        """
+
+
+@runtime_checkable
 class KnowsTruth(Protocol):
     """A camera that stands in a simulated world, and can tell what it should measure."""
 

@@ -104,7 +104,7 @@ class Scan:
             repeat=self._plan.repeat,
             calibration=None if calibration is None else "calibration.json",
             plan=self._plan.as_dict(),
-            extra={"exposure": self._exposure},
+            extra={"exposure": self._exposure, **self._opened.scan_state(self._clock)},
         )
         writer = CaptureWriter(self._folder, header, self._plan.frame_count)
         with write_backs.of(writer, self._frame_bytes) as disk:

@@ -168,6 +168,9 @@ class RigSettings(_Table):
         default="rig", min_length=1, max_length=100, description="a name for reports, 1 to 100 characters"
     )
     calibration: RelativePath | None = Field(default=None, description="path of a calibration file (JSON)")
+    marks: RelativePath | None = Field(
+        default=None, description="path of a file of witness marks (fringed calibrate marks), measured in each scan"
+    )
     phase_axis: Literal["x", "y"] | None = Field(
         default=None, description='"x" (camera beside the projector) or "y" (above or below it)'
     )

@@ -4,6 +4,7 @@ process; it opens devices through the registry and takes no frame.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -14,8 +15,8 @@ from typing import Any
 
 from drivers import registry
 from scanner.clock import Clock
-from scanner.devices import CameraSettings, Interval, KnowsTruth, ProjectorKind, TriggerMode
-from scanner.errors import ConfigError, DecodeError
+from scanner.devices import CameraSettings, Interval, KnowsTemperature, KnowsTruth, ProjectorKind, TriggerMode
+from scanner.errors import ConfigError, DecodeError, DeviceError
 from scanner.geometry import Calibration, load_calibration
 from scanner.patterns import (
     Axis,
@@ -31,6 +32,8 @@ from scanner.patterns import (
 from scanner.patterns.sequence import Precorrection
 from scanner.sequencer import Rig, measure_latency
 from scanner.wire import ScanStart
+
+_log = logging.getLogger(__name__)
 
 METHODS = ("pmp", "mcp", "gray", "cp")
 
@@ -57,6 +60,10 @@ class OpenRig:
     calibration: Calibration | None
     loaded: PatternSequence | None = None
     """what the projector holds; None: something else"""
+    opened_ns: int = 0
+    """when the devices were opened, by the clock they live in"""
+    marks: Mapping[str, Any] | None = None
+    """witness marks of the rig file, as `Marks.as_dict` has them"""
 
     @property
     def projector(self) -> ProjectorSize:
@@ -69,6 +76,17 @@ class OpenRig:
         """The rig file's exposure: microseconds, "auto" or None."""
         value: float | str | None = self.settings["camera"]["settings"]["exposure_us"]
         return value
+
+    def scan_state(self, clock: Clock) -> dict[str, Any]:
+        """Members of capture.json: how warm the rig is, and its witness marks where it has any."""
+        camera = self.rig.camera
+        warmth: dict[str, Any] = {"devices_open_s": round((clock.now_ns() - self.opened_ns) / 1e9, 1)}
+        if isinstance(camera, KnowsTemperature):
+            try:
+                warmth["camera_c"] = camera.temperature_c()
+            except DeviceError as error:  # a scan needs no thermometer
+                _log.warning("%s: its temperature was not read: %s", camera.name, error)
+        return {"warm_up": warmth} | ({} if self.marks is None else {"marks": self.marks})
 
     def measure_latency(self, clock: Clock) -> None:
         """Measure the projector's latency and settling, once, where neither rig file nor driver knows them.
@@ -104,11 +122,12 @@ def open_rig(settings: Mapping[str, Any], clock: Clock) -> OpenRig:
 
     Raises:
         ConfigError, DeviceError: see `drivers.registry`.
-        CalibrationError: the rig file's calibration is unusable.
+        CalibrationError: the rig file's calibration or marks are unusable.
     """
     camera_part, projector_part, trigger_part = (settings[key] for key in ("camera", "projector", "trigger"))
     path = settings["rig"]["calibration"]
     calibration = None if path is None else load_calibration(Path(path))
+    marks = _marks(settings["rig"].get("marks"))
     options = dict(projector_part["options"])
     if projector_part["mode"] is not None:
         options["mode"] = projector_part["mode"]
@@ -155,7 +174,7 @@ def open_rig(settings: Mapping[str, Any], clock: Clock) -> OpenRig:
         mirror=projector_part["mirror"],
         rotate=projector_part["rotate"],
     )
-    return OpenRig(rig, settings, calibration)
+    return OpenRig(rig, settings, calibration, opened_ns=clock.now_ns(), marks=marks)
 
 
 def sequence_for(opened: OpenRig, params: ScanStart) -> PatternSequence:
@@ -315,6 +334,14 @@ def inverse_table(table: Any) -> tuple[float, ...]:
     # Light that the projector cannot make is given its nearest: np.interp holds the ends. Flat parts keep one value.
     light, index = np.unique(values, return_index=True)
     return tuple(float(v) for v in np.interp(np.arange(256) / 255, light, index))
+
+
+def _marks(path: str | None) -> dict[str, Any] | None:
+    if path is None:
+        return None
+    from scanner.calibration.marks import load_marks  # noqa: PLC0415  (brings detection; few rigs have marks)
+
+    return load_marks(Path(path)).as_dict()
 
 
 def _interval(microseconds: Any) -> Interval | None:

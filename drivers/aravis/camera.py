@@ -174,6 +174,12 @@ class AravisCamera:
             return []
         return check_network(link.address, self._payload, rate_hz or fastest, self._packet_size)
 
+    def temperature_c(self) -> float | None:
+        """Of the device (SFNC DeviceTemperature), degrees Celsius; None where it has no such feature."""
+        self._check_open()
+        link = self._present_link()
+        return link.call(lambda: link.features.get_or_none("DeviceTemperature", float))
+
     def triggers_counted(self) -> int | None:
         """Triggers that the camera has counted since `start`, those included that gave no frame; None: it cannot."""
         self._check_open()

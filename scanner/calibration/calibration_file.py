@@ -46,6 +46,7 @@ def calibration_dict(solution: Solution, created: str | None = None) -> dict[str
             "minutes": solution.options.warm_up_minutes,
             "first_capture": solution.created[0] or None,
             "last_capture": solution.created[1] or None,
+            **solution.warm_up,
         },
     }
     content["id"] = content_id(content)

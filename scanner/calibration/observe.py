@@ -7,8 +7,8 @@ poses of which some are unusable still calibrates, and says which were left out 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +34,15 @@ FLATTEST = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One usable capture. response: what its patterns were corrected for; created: when it was taken."""
+    """One usable capture. response: what its patterns were corrected for; created: when it was taken; warm_up: how warm
+    the rig was, as capture.json has it."""
 
     view: View
     camera_size: tuple[int, int]
     projector_size: tuple[int, int]
     response: dict[str, Any] | None = None
     created: str = ""
+    warm_up: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,16 @@ def observe(
     return observations, left_out
 
 
+def warm_up_of(observations: Sequence[Observation]) -> dict[str, list[float]]:
+    """Least and most of what the captures say of how warm the rig was: devices_open_s, camera_c (where known)."""
+    found: dict[str, list[float]] = {}
+    for name in ("devices_open_s", "camera_c"):
+        values = [value for one in observations if isinstance(value := one.warm_up.get(name), int | float)]
+        if values:
+            found[name] = [float(min(values)), float(max(values))]
+    return found
+
+
 def observe_capture(path: Path, name: str, target: Target) -> Observation | LeftOut:
     """Decode one capture and find the target in it."""
     try:
@@ -123,6 +135,7 @@ def observe_capture(path: Path, name: str, target: Target) -> Observation | Left
         (projector.width, projector.height),
         None if correction is None else correction.describe(),
         capture.header.created,
+        capture.header.extra.get("warm_up") or {},
     )
 
 

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from scanner.calibration.adjustment import Adjusted
 from scanner.calibration.agreement import agreed
+from scanner.calibration.drift import epipolar_offsets
 from scanner.calibration.held_out import HeldOut, hold_out
 from scanner.calibration.lens_slopes import rotation_of
-from scanner.calibration.observe import LeftOut, Observation
+from scanner.calibration.observe import LeftOut, Observation, warm_up_of
 from scanner.calibration.plausibility import (
     Facing,
     check_facing,
@@ -86,6 +87,8 @@ class Solution:
     warnings: tuple[str, ...]
     response: dict[str, Any] | None = None
     created: tuple[str, str] = ("", "")
+    warm_up: Mapping[str, list[float]] = field(default_factory=dict)
+    """see `warm_up_of`, of the captures used"""
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -157,6 +160,7 @@ def solve(
         (),
         observations[0].response,
         (taken[0], taken[-1]) if taken else ("", ""),
+        warm_up_of([o for o in observations if o.view.name in used]),
     )
     return replace(solution, warnings=tuple(warnings + _warnings(solution)))
 
@@ -168,11 +172,7 @@ def epipolar_errors(problem: Problem, state: State) -> tuple[Array, ...]:
     for view, pose in zip(problem.views, state.poses, strict=True):
         rays = np.column_stack((rig.camera.normalised(view.camera), np.ones(len(view.ids))))
         depth = (problem.target.points[view.ids] @ rotation_of(pose[:3]).T + pose[3:])[:, 2:]
-        here = rig.projector.project(rig.to_projector(rays * depth))
-        there = rig.projector.project(rig.to_projector(rays * depth * 1.01))
-        along = (there - here) / np.linalg.norm(there - here, axis=1, keepdims=True)
-        off = view.projector - here
-        errors.append(off[:, 0] * along[:, 1] - off[:, 1] * along[:, 0])
+        errors.append(epipolar_offsets(rig, rays * depth, view.projector)[0])
     return tuple(errors)
 
 

@@ -18,7 +18,7 @@ from scanner.calibration.adjustment import Adjusted
 from scanner.calibration.discs import eccentricity
 from scanner.calibration.hall import decompose, hall_matrix, project_hall
 from scanner.calibration.lens_slopes import rotation_of, vector_of
-from scanner.calibration.observe import LeftOut, Observation
+from scanner.calibration.observe import LeftOut, Observation, warm_up_of
 from scanner.calibration.plausibility import Facing, check_facing
 from scanner.calibration.problem import POSES, Priors, Problem, State, View
 from scanner.calibration.solve import Progress, Solution, SolveOptions, epipolar_errors, solve, stated_length
@@ -91,6 +91,7 @@ def solve_hall(
         tuple(_warnings(facing, adjusted)),
         chosen.response,
         created,
+        warm_up_of([chosen]),
         {"hall": hall, "world": world},
     )
 

@@ -108,6 +108,17 @@ def flat_board(xyz: NDArray[Any]) -> Flatness:
     )
 
 
+def plane_of(xyz: NDArray[Any]) -> tuple[Array, Array]:
+    """A point of the largest plane in a scan, (3,) mm, and its unit normal towards the camera.
+
+    Raises:
+        DecodeError: too few points.
+    """
+    points = _finite(xyz)
+    centre, normal, _ = _plane(points[_belonging(points, _plane_distance, 3)])
+    return centre, -np.sign(normal @ centre) * normal
+
+
 def sphere(xyz: NDArray[Any], diameter_mm: float | None = None) -> Probing:
     """Measure a sphere.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import typer
 
 from service.commands import (
+    calibrate_marks,
     calibrate_response,
     calibrate_run,
     calibrate_solve,
@@ -22,6 +23,7 @@ group.command("run")(calibrate_run.run)
 group.command("solve")(calibrate_solve.solve)
 group.command("target")(calibrate_target.target)
 group.command("verify")(calibrate_verify.verify)
+group.command("marks")(calibrate_marks.marks)
 group.command("mcp")(calibrate_verify.mcp)
 group.command("sync")(calibrate_sync.sync)
 group.command("response")(calibrate_response.response)

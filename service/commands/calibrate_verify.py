@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from service.commands.calibrate_marks import region_given
 from service.commands.calibrate_solve import Replace
 from service.commands.options import AsJson, output_path
 from service.terminal import print_error, print_facts, print_json, print_table, progress_lines
 
 if TYPE_CHECKING:
+    from scanner.calibration.marks import Marks
+    from scanner.calibration.targets import Target
     from scanner.scan import Scan
 
 
@@ -34,6 +38,14 @@ def verify(
     repeat: Annotated[
         bool, typer.Option("--repeat", help="The scans are of one scene that did not move: repeatability.")
     ] = False,
+    marks: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Witness marks (calibrate marks): how far they have moved since."),
+    ] = None,
+    edge: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,W,H", help="Part of the picture with one straight edge in depth: 10-90 % width."),
+    ] = None,
     tolerance: Annotated[
         float | None, typer.Option(metavar="MM", min=0, max=1e4, help="Exit status 1 if an error is larger than this.")
     ] = None,
@@ -47,9 +59,12 @@ def verify(
       fringed calibrate verify ball1 ball2 ball3 --sphere 50.012
       fringed calibrate verify target/ --target charuco:10x7:30 --length 240.05
       fringed calibrate verify board1 board2 board3 --flat --repeat --json
+      fringed calibrate verify block/ --edge 600,300,60,200
+      fringed calibrate verify today/ --marks marks.json
     """
-    if not (flat or sphere is not None or target is not None or repeat):
-        raise typer.BadParameter("nothing to verify: give --flat, --sphere MM, --target TARGET or --repeat")
+    if not (flat or repeat or any(given is not None for given in (sphere, target, marks, edge))):
+        raise typer.BadParameter("nothing to verify: give --flat, --sphere, --target, --edge, --marks or --repeat")
+    part = None if edge is None else region_given(edge, "--edge")
     if length is not None and target is None:
         raise typer.BadParameter("--length is the length of a target's longest row: give --target too")
     if repeat and len(scans) < 2:
@@ -58,15 +73,23 @@ def verify(
         _refuse_twice(scans)
     with progress_lines() as lines:
         lines.stage("reading scans", len(scans))
+        from scanner.calibration.marks import load_marks  # noqa: PLC0415
         from scanner.calibration.targets import parse_target  # noqa: PLC0415
         from scanner.calibration.verification import plain, repeatability  # noqa: PLC0415
         from scanner.scan import load_scan  # noqa: PLC0415
 
-        wanted = None if target is None else parse_target(target)
+        wanted = _Wanted(
+            flat,
+            sphere,
+            None if target is None else parse_target(target),
+            length,
+            None if marks is None else load_marks(marks),
+            part,
+        )
         results, clouds = [], []
         for number, folder in enumerate(scans):
             scan = load_scan(folder)
-            measured = _measured(folder, scan, flat=flat, sphere_mm=sphere, target=wanted, length_mm=length)
+            measured = _measured(folder, scan, wanted)
             results.append({"scan": str(folder), **measured})
             if repeat and scan.xyz is not None:
                 clouds.append(scan.xyz)
@@ -160,47 +183,75 @@ def _refuse_twice(scans: list[Path]) -> None:
             seen[key] = folder
 
 
-def _measured(
-    folder: Path, scan: Scan, *, flat: bool, sphere_mm: float | None, target: Any, length_mm: float | None
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Wanted:
+    """What is to be measured in each scan."""
+
+    flat: bool
+    sphere_mm: float | None
+    target: Target | None
+    length_mm: float | None
+    marks: Marks | None
+    edge: tuple[int, int, int, int] | None
+
+
+def _measured(folder: Path, scan: Scan, wanted: _Wanted) -> dict[str, Any]:
     from scanner.calibration import verification  # noqa: PLC0415
+    from scanner.calibration.edges import edge_width  # noqa: PLC0415
+    from scanner.calibration.marks import measured_marks  # noqa: PLC0415
     from scanner.errors import DecodeError  # noqa: PLC0415
 
     if scan.xyz is None:
         raise DecodeError(f"{folder} has no points", hint="decode it with a calibration: fringed decode --calibration")
+    plain = verification.plain
     found: dict[str, Any] = {}
-    if flat:
-        found["flat"] = verification.plain(verification.flat_board(scan.xyz))
-    if sphere_mm is not None:
-        found["sphere"] = verification.plain(verification.sphere(scan.xyz, sphere_mm))
-    if target is not None:
-        found["length"] = verification.plain(verification.target_length(scan.albedo, scan.xyz, target, length_mm))
+    if wanted.flat:
+        found["flat"] = plain(verification.flat_board(scan.xyz))
+    if wanted.sphere_mm is not None:
+        found["sphere"] = plain(verification.sphere(scan.xyz, wanted.sphere_mm))
+    if wanted.target is not None:
+        found["length"] = plain(verification.target_length(scan.albedo, scan.xyz, wanted.target, wanted.length_mm))
+    if wanted.edge is not None:
+        x, y, width, height = wanted.edge
+        found["edge"] = plain(edge_width(scan.xyz[y : y + height, x : x + width]))
+    if wanted.marks is not None:
+        found["marks"] = measured_marks(wanted.marks, scan.albedo, scan.xyz)
     return found
 
 
 def _worst(document: dict[str, Any]) -> float:
-    """The largest of all errors, mm: flatness, form, size, length, repeatability."""
+    """The largest of all errors, mm: flatness, form, size, length, repeatability, marks. An edge's width is none."""
     errors = [document["repeatability"]["depth_mm"]] if "repeatability" in document else []
     for one in document["scans"]:
         errors += [one["flat"]["flatness_mm"]] if "flat" in one else []
         errors += [one["sphere"]["form_mm"], abs(one["sphere"]["size_mm"])] if "sphere" in one else []
         errors += [abs(one["length"]["error_mm"])] if "length" in one else []
-    return float(max(errors))
+        if "marks" in one:
+            errors += [
+                one["marks"].get("largest_mm", 0.0),
+                abs((one["marks"].get("plate") or {}).get("offset_mm") or 0),
+            ]
+    return float(max(errors, default=0.0))
 
 
 def _show(document: dict[str, Any]) -> None:
-    for kind in ("flat", "sphere", "length"):
+    for kind in ("flat", "sphere", "length", "edge", "marks"):
         rows = [(one["scan"], one[kind]) for one in document["scans"] if kind in one]
         if not rows:
             continue
         names = [name for name, value in rows[0][1].items() if isinstance(value, int | float)]
-        cells = ([scan, *(_cell(values[name]) for name in names)] for scan, values in rows)
+        cells = ([scan, *(_cell(values.get(name)) for name in names)] for scan, values in rows)
         print_table(kind, ("scan", *(name.replace("_", " ") for name in names)), cells)
+    for one in document["scans"]:
+        if (said := one.get("marks", {}).get("warning")) is not None:
+            print_error(f"{one['scan']}: {said}", label="warning")
     facts = [(name.replace("_", " "), _cell(value)) for name, value in document.get("repeatability", {}).items()]
     print_facts("verification", [*facts, ("largest error", f"{document['largest_error_mm']:.4f} mm")])
 
 
-def _cell(value: float) -> str:
+def _cell(value: float | None) -> str:
+    if value is None:
+        return "-"
     return f"{value:,}" if isinstance(value, int) else f"{value:.4f}"
 
 

@@ -55,6 +55,9 @@ def test_a_rig_is_calibrated_by_itself(rig: Path, tmp_path: Path, capsys: pytest
     first = Capture.open(folder / "poses" / "01")
     assert set(first.header.sequence.pattern.axes) == {"x", "y"}  # type: ignore[union-attr]
     assert document["calibration"]["scale"] == "unverified"
+    opened = document["calibration"]["warm_up"]["devices_open_s"]
+    assert 0 < opened[0] < opened[1] < 120
+    assert first.header.extra["warm_up"]["devices_open_s"] == opened[0]
     for words_said in (
         "taken from the rig file",
         "response: light follows",

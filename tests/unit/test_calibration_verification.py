@@ -18,6 +18,7 @@ from scanner.geometry import load_calibration
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
 from scanner.scan import Scan
 from service.cli import main
+from tests.unit.test_calibration_marks import PLACES, field
 
 HEIGHT, WIDTH = 120, 160
 
@@ -242,9 +243,41 @@ def test_verify_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     capsys.readouterr()
     assert main(["calibrate", "verify", row, "--target", "chessboard:9x6:12", "--length", "95.5", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["scans"][0]["length"]["error_mm"] == pytest.approx(0.5, abs=0.02)
+    # The scene has one edge in depth: 10 mm between the left of column 80 and the right.
+    stepped = board(0.02)
+    stepped[:, 80:, 2] += 10.0
+    folder = str(save(tmp_path / "step", stepped))
+    capsys.readouterr()
+    assert main(["calibrate", "verify", folder, "--edge", "40,10,80,100", "--json"]) == 0
+    edge = json.loads(capsys.readouterr().out)["scans"][0]["edge"]
+    assert edge["width_px"] < 1.5
+    assert edge["step_mm"] == pytest.approx(10.0, abs=0.1)
+    assert main(["calibrate", "verify", folder, "--edge", "40,10,80"]) == 2
     empty = str(save(tmp_path / "rows", None, np.full((40, 50), 9, np.float32)))
     assert main(["calibrate", "verify", empty, "--flat"]) == 1
     assert "has no points" in capsys.readouterr().err
+
+
+def test_marks_are_kept_and_verified(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    albedo, xyz = field()
+    before, after = (
+        save(tmp_path / "before", xyz, albedo),
+        save(tmp_path / "after", xyz + np.array([0, 0, 0.4]), albedo),
+    )
+    file = tmp_path / "marks.json"
+    words = ["calibrate", "marks", str(before), "-o", str(file)]
+    at = [word for x, y in PLACES for word in ("--at", f"{x:g},{y:g}")]
+    assert main([*words, *at, "--plate", "140,100,120,60"]) == 0
+    assert "mark 3" in capsys.readouterr().out
+    assert main([*words, *at]) == 2
+    assert main([*words, "--force", "--at", "3"]) == 2
+    assert main([*words, "--force", *at[:4]]) == 1
+    capsys.readouterr()
+    assert main(["calibrate", "verify", str(before), "--marks", str(file), "--tolerance", "0.05"]) == 0
+    capsys.readouterr()
+    assert main(["calibrate", "verify", str(after), "--marks", str(file), "--tolerance", "0.1", "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["largest_error_mm"] == pytest.approx(0.4, abs=0.02)
 
 
 def test_mcp_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
