@@ -15,6 +15,7 @@ from scanner.devices import CameraSettings, ChecksSetup, ProjectorKind, TableSlo
 from scanner.errors import ScannerError
 from scanner.sequencer import Rig, measure_latency
 from scanner.sequencer.light import Light, measure_light
+from scanner.sequencer.picture import measure_picture
 from service.config import RigConfig
 from service.doctor import Finding, Level
 from service.scan_setup import OpenRig, open_rig
@@ -30,6 +31,17 @@ LINEAR = 0.05
 
 MOST_MISFIT = 0.02
 """Rms that a pure exponent may leave: beyond, a table is wanted"""
+
+LEAST_CHECKER = 0.45
+"""Of white's light, for a checker of single pixels: a tenth less than the half that it has where pixels stay pixels. A
+picture scaled at gamma 2.2 has a third; wires too slow for a pixel clock lose light likewise"""
+
+MOST_DYNAMIC = 0.1
+"""By which a white patch may change when all around it turns black: stray light of lens and scene is some per cent,
+dynamic contrast and automatic exposure are tens"""
+
+SAME_RATE = 3e-4
+"""59.94 and 60 Hz are 1e-3 apart; the clocks of graphics cards and ours are good to 1e-4"""
 
 PULSES = 20
 
@@ -49,7 +61,7 @@ def examine_rig(config: RigConfig, clock: Clock, stage: Stage) -> Iterator[Findi
         return
     try:
         yield Finding("devices", Level.OK, f"{opened.rig.camera.name}; {opened.rig.projector.name}")
-        looks = [("host", host), ("latency", latency), ("light", light)]
+        looks = [("host", host), ("latency", latency), ("light", light), ("picture", picture)]
         looks += [("trigger line", pulses)] if opened.rig.trigger is not None else []
         for name, look in looks:
             stage(f"measuring {name}")
@@ -113,6 +125,40 @@ def light(opened: OpenRig, clock: Clock) -> Iterator[Finding]:
     yield _flicker(found)
     if found.gamma is not None:
         yield _gamma(found, opened)
+
+
+def picture(opened: OpenRig, clock: Clock) -> Iterator[Finding]:
+    """Whether pixels stay pixels, greys stay what they are, and the refresh is the one that is set."""
+    rig, declared = opened.rig, opened.rig.projector.capabilities
+    if declared.kind is not ProjectorKind.FRAMEBUFFER:
+        yield Finding("pixels", Level.OK, "the projector shows its own pictures")
+        return
+    settings = CameraSettings(None, rig.settings.gain_db, rig.settings.pixel_format, rig.settings.region)
+    found = measure_picture(rig.projector, rig.camera, clock, settings=settings, trigger_mode=rig.trigger_mode)
+    off = (
+        "on the projector, switch keystone, overscan, zoom and sharpness off, and set the rig file's mode to its native"
+    )
+    said = f"a checker of single pixels has {found.checker:.0%} of white's light"
+    sharp = abs(found.checker - 0.5) <= 0.5 - LEAST_CHECKER
+    yield Finding("pixels", Level.OK if sharp else Level.BAD, said, "" if sharp else f"{off} one")
+    said = f"a white patch on black has {found.patch:.0%} of its light in a white picture"
+    steady = abs(found.patch - 1) <= MOST_DYNAMIC
+    mend = "switch the projector's dynamic contrast, iris and eco modes off, and the camera's automatics"
+    yield Finding("dynamics", Level.OK if steady else Level.BAD, said, "" if steady else mend)
+    yield _rate(found.refresh_ns, declared.refresh_ns)
+
+
+def _rate(measured_ns: float | None, declared_ns: int) -> Finding:
+    declared = f"{1e9 / declared_ns:.3f} Hz"
+    if measured_ns is None:
+        return Finding("refresh", Level.OK, f"{declared}, as the driver says: its stamps are estimates")
+    said = f"{1e9 / measured_ns:.3f} Hz, the driver says {declared}"
+    if abs(measured_ns - declared_ns) <= SAME_RATE * declared_ns:
+        return Finding("refresh", Level.OK, said)
+    mend = (
+        f'in [projector] set mode = "...@{1e9 / measured_ns:.2f}": exposures are whole refreshes, and 59.94 is not 60'
+    )
+    return Finding("refresh", Level.BAD, said, mend)
 
 
 def pulses(opened: OpenRig, clock: Clock) -> Iterator[Finding]:

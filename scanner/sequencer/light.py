@@ -74,14 +74,14 @@ def measure_light(
     static = projector.capabilities.kind is ProjectorKind.STATIC
     refresh = projector.capabilities.refresh_ns
     with Shots(projector, camera, clock, settings=settings, trigger_mode=trigger_mode) as shots:
-        exposure = _exposure(shots, refresh)
-        black = np.zeros((1, 1)) if static else _shot(shots, BLACK)
-        white = _shot(shots, WHITE)
-        lit = _lit(white - black, camera.capabilities.max_value, shots)
-        means = np.array([_shot(shots, WHITE)[lit].mean() for _ in range(FRAMES)])
+        exposure = fitting_exposure(shots, refresh)
+        black = np.zeros((1, 1)) if static else grey_levels(shots, BLACK)
+        white = grey_levels(shots, WHITE)
+        lit = lit_part(white - black, camera.capabilities.max_value, shots)
+        means = np.array([grey_levels(shots, WHITE)[lit].mean() for _ in range(FRAMES)])
         gamma, misfit = (None, 0.0) if static else _gamma(shots, lit)
         shots.expose_for(max(refresh // 8, camera.capabilities.exposure_min_ns))
-        short_dark = 0.0 if static else float(_shot(shots, BLACK)[lit].mean())
+        short_dark = 0.0 if static else float(grey_levels(shots, BLACK)[lit].mean())
         short = _over_a_refresh(shots, refresh, lit)
     dark = float(black[lit].mean()) if not static else 0.0
     return Light(
@@ -96,24 +96,25 @@ def measure_light(
     )
 
 
-def _exposure(shots: Shots, refresh: int) -> int:
+def fitting_exposure(shots: Shots, refresh: int) -> int:
     """Whole refreshes at which white does not clip, or a part of one where a whole one does."""
     caps = shots.camera.capabilities
     exposure = refresh
     for _ in range(8):
         shots.expose_for(exposure)
-        top = float(np.percentile(_shot(shots, WHITE), 99.5))
+        top = float(np.percentile(grey_levels(shots, WHITE), 99.5))
         if top < SPARED * caps.max_value or exposure // 2 < caps.exposure_min_ns:
             break
         exposure //= 2
     return exposure
 
 
-def _shot(shots: Shots, image: int) -> NDArray[np.float64]:
+def grey_levels(shots: Shots, image: int) -> NDArray[np.float64]:
+    """A steady image of the projector's as the camera sees it."""
     return shots.steady(image).pixels.astype(np.float64)
 
 
-def _lit(contrast: NDArray[np.float64], max_value: int, shots: Shots) -> NDArray[np.bool_]:
+def lit_part(contrast: NDArray[np.float64], max_value: int, shots: Shots) -> NDArray[np.bool_]:
     """Where the projector makes a difference, at least a quarter of what it makes at best."""
     most = float(np.percentile(contrast, 99))
     if most < LEAST_CONTRAST * max_value:
@@ -142,7 +143,7 @@ def _gamma(shots: Shots, lit: NDArray[np.bool_]) -> tuple[float, float]:
     levels = np.array(GREYS)
     shots.projector.load([np.full((size.height, size.width), level, np.uint8) for level in GREYS])
     shots.images = len(GREYS)
-    seen = np.array([_shot(shots, i)[lit].mean() for i in range(len(GREYS))])
+    seen = np.array([grey_levels(shots, i)[lit].mean() for i in range(len(GREYS))])
     share = np.clip((seen - seen[0]) / max(1e-9, seen[-1] - seen[0]), 1e-6, None)
     inner = slice(1, -1)
     x, y = np.log(levels[inner] / 255), np.log(share[inner])

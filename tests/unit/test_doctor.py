@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
+import numpy as np
 import pytest
 
 from drivers.registry import open_camera, open_projector
 from drivers.simulated.camera import SimulatedCamera
+from drivers.simulated.projector import SimulatedProjector
 from scanner.clock import VirtualClock
 from scanner.sequencer.light import measure_light
-from service import doctor
+from service import doctor, doctor_rig
 from service.config import RigConfig, simulated_rig
 from service.doctor import Finding, Level, Machine
 from service.doctor_rig import examine_rig
+from service.scan_setup import open_rig
 
 
 @pytest.fixture
@@ -167,6 +172,57 @@ def test_a_board_that_hears_nothing_is_bad() -> None:
     found = one(examined(device, trigger={"driver": "simulated", "device": device}), "trigger line")
     assert found.level is Level.BAD
     assert "VSYNC" in found.says
+
+
+# --- the picture --------------------------------------------------------------------------------------------------
+
+
+def pictured(monkeypatch: pytest.MonkeyPatch, change: Callable[[np.ndarray], np.ndarray]) -> list[Finding]:
+    """What is found of a projector that makes something else of its images; gamma 2.3."""
+    load = SimulatedProjector.load
+    monkeypatch.setattr(SimulatedProjector, "load", lambda self, images: load(self, [change(i) for i in images]))
+    opened = open_rig(simulated_rig("quick/board").model_dump(mode="json"), clock := VirtualClock())
+    try:
+        return list(doctor_rig.picture(opened, clock))
+    finally:
+        opened.close()
+
+
+def _keystoned(image: np.ndarray) -> np.ndarray:
+    """Nine tenths of its width, by linear interpolation, in a black frame."""
+    height, width = image.shape
+    small = cv2.resize(image, (round(0.9 * width), height), interpolation=cv2.INTER_LINEAR)
+    return np.pad(small, ((0, 0), (0, width - small.shape[1])))
+
+
+def test_a_picture_that_comes_as_it_is_sent_is_sound(monkeypatch: pytest.MonkeyPatch) -> None:
+    findings = pictured(monkeypatch, lambda image: image)
+    assert [(found.subject, found.level) for found in findings] == [
+        ("pixels", Level.OK),
+        ("dynamics", Level.OK),
+        ("refresh", Level.OK),
+    ]
+    assert "60.000 Hz" in findings[2].says
+
+
+def test_keystone_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = one(pictured(monkeypatch, _keystoned), "pixels")
+    assert found.level is Level.BAD
+    assert "keystone" in found.mend
+
+
+def test_dynamic_contrast_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    def dimmed(image: np.ndarray) -> np.ndarray:
+        return image if image.mean() > 100 else (0.8 * image).astype(np.uint8)
+
+    found = one(pictured(monkeypatch, dimmed), "dynamics")
+    assert found.level is Level.BAD
+    assert "dynamic contrast" in found.mend
+
+
+def test_a_rate_that_is_another_is_told() -> None:
+    assert doctor_rig._rate(1e9 / 59.94, 16_666_667).level is Level.BAD
+    assert doctor_rig._rate(None, 16_666_667).level is Level.OK
 
 
 # --- light --------------------------------------------------------------------------------------------------------
