@@ -14,7 +14,7 @@ from drivers.v4l2 import controls, exposure, formats, timings
 from drivers.v4l2.exposure import Stamping
 from drivers.v4l2.node import VideoNode, open_node
 from drivers.v4l2.options import CameraOptions
-from drivers.v4l2.queue import SLICE_MS, BufferQueue, Dequeued
+from drivers.v4l2.queue import SLICE_MS, BufferQueue, Dequeued, FrameCount
 from scanner.clock import Clock
 from scanner.devices import (
     CameraCapabilities,
@@ -44,6 +44,7 @@ class V4l2Camera:
         self._streaming = False
         self._lent: int | None = None
         self._begun_ns = 0
+        self._count = FrameCount()
         try:
             kind = self._found.buffer_type("camera")
             assert kind is not None  # noqa: S101  # open_node made sure
@@ -123,6 +124,7 @@ class V4l2Camera:
         for index in range(len(queue)):
             queue.put(index)
         self._begun_ns = self._clock.now_ns()
+        self._count = FrameCount()
         queue.on()
         self._streaming = True
 
@@ -258,7 +260,7 @@ class V4l2Camera:
         if pixels is None:
             pixels = self._capture.black(self._format)
         exposed = self._stamping.exposure(taken, self._begun_ns, self._clock.now_ns(), self._name)
-        return CameraFrame(pixels, taken.sequence, exposed, complete)
+        return CameraFrame(pixels, self._count.next(taken.sequence), exposed, complete)
 
     def _require_queue(self) -> BufferQueue:
         if self._queue is None:

@@ -16,7 +16,7 @@ from drivers.display import check_images
 from drivers.v4l2 import formats, timings
 from drivers.v4l2.node import VideoNode, open_node
 from drivers.v4l2.options import OutputOptions
-from drivers.v4l2.queue import SLICE_MS, BufferQueue, Dequeued
+from drivers.v4l2.queue import SLICE_MS, BufferQueue, Dequeued, FrameCount
 from scanner.clock import Clock
 from scanner.devices import Flip, Image, ProjectorCapabilities, Source
 from scanner.errors import ConfigError, DeviceError
@@ -45,6 +45,7 @@ class V4l2Output:
         self._images: list[Image] = []
         self._queue: BufferQueue | None = None
         self._on_show: int | None = None
+        self._count = FrameCount()
         try:
             kind = self._found.buffer_type("projector")
             assert kind is not None  # noqa: S101  # open_node made sure
@@ -181,7 +182,7 @@ class V4l2Output:
             )
         return Flip(
             t_ns=returned.t_ns if believable else now,
-            vblank=returned.sequence,
+            vblank=self._count.next(returned.sequence),
             bound_ns=self._period_ns if bound is None else round(1e3 * bound),
             source=Source.ESTIMATED if bound is None else Source.DRIVER,
         )

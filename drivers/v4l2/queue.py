@@ -25,6 +25,9 @@ SLICE_MS = 200
 """A wait is cut into pieces: not every driver wakes its sleepers when its device is pulled out"""
 
 
+_HALF = 1 << 31
+
+
 @dataclass(frozen=True)
 class Dequeued:
     """A buffer that came back."""
@@ -38,6 +41,27 @@ class Dequeued:
     monotonic: bool
     start_of_exposure: bool
     damaged: bool
+
+
+class FrameCount:
+    """A driver's numbers as a count that always goes on, past the wrap at 2^32.
+
+    Drivers that number frames by the clock (vivid; sensors behind some bridges) give two frames one number when a late
+    one is followed by one in time: the second then takes the next number, and later ones their own again.
+    """
+
+    def __init__(self) -> None:
+        self._raw: int | None = None
+        self._unwrapped = 0
+        self._last = -1
+
+    def next(self, sequence: int) -> int:
+        """The count of the frame that the driver calls `sequence`."""
+        step = 0 if self._raw is None else (sequence - self._raw + _HALF) % (2 * _HALF) - _HALF
+        self._unwrapped = sequence if self._raw is None else self._unwrapped + step
+        self._raw = sequence
+        self._last = max(self._last + 1, self._unwrapped)
+        return self._last
 
 
 class BufferQueue:

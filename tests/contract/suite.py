@@ -93,10 +93,17 @@ class ProjectorContract:
         assert called - flip.bound_ns <= flip.t_ns <= bench.clock.now_ns() + flip.bound_ns
 
     def test_a_flip_waits_for_the_next_blank_only(self, bench: ProjectorBench) -> None:
-        bench.projector.load(bench.images(2))
-        called = bench.clock.now_ns()
-        flip = bench.projector.show(0)
-        assert flip.t_ns - called <= 2 * bench.projector.capabilities.refresh_ns + flip.bound_ns
+        """A machine may be late now and then; a driver that waits for a later blank always is."""
+        images = bench.images(2)
+        bench.projector.load(images)
+        waits = []
+        for attempt in range(5):
+            called = bench.clock.now_ns()
+            flip = bench.projector.show(attempt % len(images))
+            waits.append(flip.t_ns - called - flip.bound_ns)
+            if waits[-1] <= 2 * bench.projector.capabilities.refresh_ns:
+                return
+        pytest.fail(f"every flip was late: {waits} ns")
 
     def test_load_takes_its_own_size_only(self, bench: ProjectorBench) -> None:
         c = bench.projector.capabilities

@@ -40,6 +40,7 @@ from tests.rig.installed import (
     wait_for,
     write_rig,
 )
+from tests.rig.punctual import ATTEMPTS
 
 pytestmark = pytest.mark.timeout(420)
 
@@ -52,8 +53,6 @@ CAMERA = "/dev/v4l/by-path/platform-vivid.0-video-index0"
 """The node's number may be another one after it was pulled out"""
 
 LOSS_S, RETURN_S = 1.0, 5.0
-ATTEMPTS = 3
-"""An emulated machine may be late, whatever it runs: only what is late every time is a fault"""
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -21,6 +21,7 @@ from scanner.clock import MonotonicClock
 from scanner.devices import Source
 from scanner.errors import ConfigError, DeviceBusy, DeviceError, DeviceLost, DeviceNotFound
 from tests.contract.suite import ProjectorBench, ProjectorContract
+from tests.rig.punctual import punctual
 
 OUTPUT = "Virtual-1"
 SMALL = "640x480"
@@ -172,32 +173,34 @@ def test_the_screen_is_given_back(projector: KmsProjector) -> None:
         card.close()
 
 
-def test_the_cable_is_pulled_idle(connection: Callable[[str], None], projector: KmsProjector) -> None:
-    projector.load([np.zeros((480, 640), dtype=np.uint8)])
-    connection("off")
-    before = time.monotonic()
-    with pytest.raises(DeviceLost):
-        projector.show(0)
-    assert time.monotonic() - before < 1
-    projector.close()
-    with pytest.raises(DeviceNotFound):
-        _open()
-    connection("on")
-    again = _open()
-    again.load([np.zeros((480, 640), dtype=np.uint8)])
-    again.show(0)
-    again.close()
+@pytest.mark.parametrize("state", ["idle", "mid-sequence"])
+def test_a_display_that_goes_is_lost_at_once_and_works_when_it_is_back(
+    connection: Callable[[str], None], state: str
+) -> None:
+    black = np.zeros((480, 640), dtype=np.uint8)
 
+    def pull() -> float:
+        projector = _open()
+        projector.load([black])
+        for _ in range(5 if state == "mid-sequence" else 0):
+            projector.show(0)
+        connection("off")
+        before = time.monotonic()
+        for use in (projector.check_present, lambda: projector.show(0), lambda: projector.show(0)):
+            with pytest.raises(DeviceLost):
+                use()
+        took = time.monotonic() - before
+        projector.close()
+        with pytest.raises(DeviceNotFound):
+            _open()
+        connection("on")
+        again = _open()
+        again.load([black])
+        again.show(0)
+        again.close()
+        return took
 
-def test_the_cable_is_pulled_mid_sequence(connection: Callable[[str], None], projector: KmsProjector) -> None:
-    projector.load([np.zeros((480, 640), dtype=np.uint8)])
-    for _ in range(5):
-        projector.show(0)
-    connection("off")
-    with pytest.raises(DeviceLost):
-        projector.show(0)
-    with pytest.raises(DeviceLost):
-        projector.show(0)
+    punctual(1, pull)
 
 
 def test_what_is_not_there_is_named() -> None:

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from drivers.ioctl import Node
+from drivers.kms.projector import KmsProjector
+from drivers.kms.writeback import read_back
 from drivers.registry import open_camera, open_projector
 from drivers.v4l2 import camera_driver, controls, projector_driver
 from drivers.v4l2.camera import V4l2Camera
@@ -22,6 +24,7 @@ from scanner.devices import CameraFrame, CameraSettings, Source, TriggerMode
 from scanner.errors import ConfigError, DeviceBusy, DeviceError, DeviceLost, DeviceNotFound
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
 from tests.rig import vivid
+from tests.rig.punctual import punctual
 
 SECOND_NS = 1_000_000_000
 BY_PATH = "platform-vivid.0-video-index0"
@@ -78,23 +81,43 @@ def test_pictures_come_back_pixel_for_pixel(code: str) -> None:
             assert np.array_equal(_seen(shown, seen, index), images[index])
 
 
-def test_a_pmp_sequence_goes_round_and_is_decoded() -> None:
-    """Every frame is its pattern to the bit, so the decoded rows are the pattern's own."""
+@pytest.mark.parametrize("through_kms", [False, True])
+def test_a_pmp_sequence_goes_round_and_is_decoded(through_kms: bool) -> None:
+    """Every frame is its pattern to the bit, so the decoded rows are the pattern's own.
+
+    Through KMS, what goes into the loop is what a KMS display was sent, read back.
+    """
     vivid.join()
     pattern = PmpPattern(frequencies=(1.0, 8.0), shifts=(4, 4))
     sequence = PatternSequence.bracketed(ProjectorSize(vivid.WIDTH, vivid.HEIGHT), pattern)
     decoder = decoder_for(sequence, CameraFormat(vivid.WIDTH, vivid.HEIGHT, 8))
+    images = [sequence.image(position) for position in range(len(sequence))]
     with projector(pixel_format="GREY") as shown, camera(pixel_format="GREY") as seen:
-        shown.load([sequence.image(position) for position in range(len(sequence))])
+        shown.load(_sent_by_kms(images) if through_kms else images)
         seen.start(TriggerMode.FREE)
-        for position in range(len(sequence)):
+        for position, image in enumerate(images):
             frame = _seen(shown, seen, position)
-            assert np.array_equal(frame, sequence.image(position))
+            assert np.array_equal(frame, image)
             decoder.add(position, frame)
     rows = decoder.finish().rows
     assert rows is not None
     # Greys are rounded to 1/255: 8 bits over eight fringes of 60 rows are good to a tenth of a row.
     assert np.abs(rows - np.arange(vivid.HEIGHT)[:, np.newaxis]).max() < 0.1
+
+
+def _sent_by_kms(images: list[np.ndarray]) -> list[np.ndarray]:
+    """What a KMS display of the same size is sent for these images: its green."""
+    display = open_projector("kms", "Virtual-1", {"mode": f"{vivid.WIDTH}x{vivid.HEIGHT}"}, MonotonicClock())
+    assert isinstance(display, KmsProjector)
+    try:
+        display.load(images)
+        sent = []
+        for index in range(len(images)):
+            display.show(index)
+            sent.append(np.ascontiguousarray(read_back(display)[..., 1]))
+        return sent
+    finally:
+        display.close()
 
 
 # --- counts, stamps, controls -----------------------------------------------------------------------------------
@@ -211,49 +234,61 @@ def pulled() -> Iterator[None]:
 @pytest.mark.usefixtures("pulled")
 @pytest.mark.parametrize("state", ["idle", "armed", "mid-sequence"])
 def test_a_camera_pulled_out_is_lost_at_once(state: str) -> None:
-    with camera() as seen:
-        if state != "idle":
-            seen.start(TriggerMode.FREE)
-        if state == "mid-sequence":
-            for _ in range(3):
-                _popped(seen)
-        vivid.unplug()
-        before = time.monotonic()
-        with pytest.raises(DeviceLost):
-            _until_lost(seen) if state != "idle" else seen.apply(CameraSettings())
-        assert time.monotonic() - before < 1
-        seen.stop()
-    with pytest.raises(DeviceNotFound), camera():
-        pass
+    def pull() -> float:
+        vivid.plug_in()
+        with camera() as seen:
+            if state != "idle":
+                seen.start(TriggerMode.FREE)
+            if state == "mid-sequence":
+                for _ in range(3):
+                    _popped(seen)
+            vivid.unplug()
+            before = time.monotonic()
+            with pytest.raises(DeviceLost):
+                _until_lost(seen) if state != "idle" else seen.check_present()
+            took = time.monotonic() - before
+            seen.stop()
+        with pytest.raises(DeviceNotFound), camera():
+            pass
+        return took
+
+    punctual(1, pull)
 
 
 @pytest.mark.usefixtures("pulled")
 @pytest.mark.parametrize("state", ["idle", "mid-sequence"])
 def test_a_projector_pulled_out_is_lost_at_once(state: str) -> None:
     black = np.zeros((vivid.HEIGHT, vivid.WIDTH), dtype=np.uint8)
-    with projector() as shown:
-        shown.load([black])
-        if state == "mid-sequence":
-            for _ in range(3):
-                shown.show(0)
-        vivid.unplug()
-        before = time.monotonic()
-        with pytest.raises(DeviceLost):
-            shown.show(0)
-        with pytest.raises(DeviceLost):
+
+    def pull() -> float:
+        vivid.plug_in()
+        with projector() as shown:
             shown.load([black])
-        assert time.monotonic() - before < 1
+            if state == "mid-sequence":
+                for _ in range(3):
+                    shown.show(0)
+            vivid.unplug()
+            before = time.monotonic()
+            for use in (shown.check_present, lambda: shown.show(0), lambda: shown.load([black])):
+                with pytest.raises(DeviceLost):
+                    use()
+            return time.monotonic() - before
+
+    punctual(1, pull)
 
 
 def test_devices_put_back_work_within_seconds() -> None:
-    vivid.unplug()
-    before = time.monotonic()
-    vivid.plug_in()
-    with projector(pixel_format="GREY") as shown, camera(pixel_format="GREY") as seen:
-        shown.load([np.full((vivid.HEIGHT, vivid.WIDTH), 77, dtype=np.uint8)])
-        seen.start(TriggerMode.FREE)
-        assert np.all(_seen(shown, seen, 0) == 77)
-    assert time.monotonic() - before < 5
+    def put_back() -> float:
+        vivid.unplug()
+        before = time.monotonic()
+        vivid.plug_in()
+        with projector(pixel_format="GREY") as shown, camera(pixel_format="GREY") as seen:
+            shown.load([np.full((vivid.HEIGHT, vivid.WIDTH), 77, dtype=np.uint8)])
+            seen.start(TriggerMode.FREE)
+            assert np.all(_seen(shown, seen, 0) == 77)
+        return time.monotonic() - before
+
+    punctual(5, put_back)
 
 
 def _until_lost(seen: V4l2Camera) -> None:

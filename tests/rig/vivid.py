@@ -34,8 +34,9 @@ def bind() -> None:
 
 
 def plug_in() -> None:
-    """Bind again, and wait for the nodes."""
-    bind()
+    """Bind again unless it is, and wait for the nodes."""
+    if not (_DRIVER / "vivid.0").exists():
+        bind()
     deadline = time.monotonic() + 10
     while not all(Path(node).exists() for node in (CAMERA, PROJECTOR)):
         assert time.monotonic() < deadline

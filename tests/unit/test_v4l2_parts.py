@@ -17,7 +17,7 @@ from drivers.v4l2 import node
 from drivers.v4l2.controls import EXPOSURE_ABSOLUTE, Control, control_name
 from drivers.v4l2.exposure import EXPOSURE_UNIT_NS, ExposureControl, Stamping
 from drivers.v4l2.formats import CAPTURE_FORMATS, OUTPUT_FORMATS, FrameFormat, pack
-from drivers.v4l2.queue import Dequeued
+from drivers.v4l2.queue import Dequeued, FrameCount
 from drivers.v4l2.timings import parse_mode, same_rate
 from scanner.clock import VirtualClock
 from scanner.devices import Source
@@ -154,6 +154,20 @@ def test_exposures_are_rounded_down_to_what_the_control_has(
 def test_an_exposure_is_no_longer_than_the_period() -> None:
     means = ExposureControl(_control(1, 5000, 1), EXPOSURE_UNIT_NS)
     assert means.bounds(33_333_333) == (100_000, 33_300_000, 100_000)
+
+
+@pytest.mark.parametrize(
+    ("said", "counted"),
+    [
+        ([0, 1, 2, 5], [0, 1, 2, 5]),
+        ([10, 10, 12, 13], [10, 11, 12, 13]),  # two with one number: the next is its own again, and no frame is missed
+        ([10, 10, 11, 14], [10, 11, 12, 14]),
+        ([2**32 - 1, 0, 3], [2**32 - 1, 2**32, 2**32 + 3]),
+    ],
+)
+def test_frames_are_counted_on_past_numbers_given_twice_and_the_wrap(said: list[int], counted: list[int]) -> None:
+    count = FrameCount()
+    assert [count.next(sequence) for sequence in said] == counted
 
 
 def _control(minimum: int, maximum: int, step: int) -> Control:
