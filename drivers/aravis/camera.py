@@ -11,35 +11,24 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from drivers.aravis import settings as camera_settings
-from drivers.aravis import triggers
+from drivers.aravis import stamps, triggers
 from drivers.aravis.frame_ids import FrameIds
 from drivers.aravis.link import Link
 from drivers.aravis.network import Finding, check_network
-from drivers.aravis.options import Options
+from drivers.aravis.options import AravisOptions
 from drivers.aravis.pixels import unpacked
+from drivers.aravis.reopening import Reopening
 from drivers.aravis.stream import Received, Stream
 from scanner.clock import Clock
-from scanner.devices import CameraCapabilities, CameraFrame, CameraSettings, Exposure, Source, TriggerMode
-from scanner.errors import ConfigError, DeviceBusy, DeviceError, DeviceLost, ScannerError
+from scanner.devices import CameraCapabilities, CameraFrame, CameraSettings, TriggerMode
+from scanner.errors import ConfigError, DeviceBusy, DeviceError, DeviceLost
 
-PAUSE_S, LONGEST_PAUSE_S = 0.25, 2.0
-"""Between attempts to open a lost camera: doubled each time"""
-
-LEAST_BOUND_NS = 20_000
-"""No stamp of a camera is declared truer than this: its own exposure start jitters, too"""
-
-BOUND_MARGIN = 3
-"""Declared is this many times what was measured: the bound must hold while the host is busy"""
-
-CLOCK_EVERY_NS = 500_000_000
-STALE_NS = 750_000_000
 POP_LOOK_S = 0.05
-CLOSED_S = 10.0
+"""A wait for a frame is interrupted this often to see whether the camera is lost"""
 
 _log = logging.getLogger(__name__)
 
@@ -47,9 +36,8 @@ _log = logging.getLogger(__name__)
 class AravisCamera:
     """See `scanner.devices.Camera`. `details` tells counters and what was switched off."""
 
-    def __init__(self, device: str, options: Options, clock: Clock) -> None:
+    def __init__(self, device: str, options: AravisOptions, clock: Clock) -> None:
         """Open it; see `CameraDriver.open`."""
-        self._device = device
         self._options = options
         self._clock = clock
         self._name = f"aravis camera {device}".rstrip()
@@ -58,16 +46,10 @@ class AravisCamera:
         self._open = True
         self._lent: Received | None = None
         self._ids = FrameIds()
-        self._next_clock_ns = 0
-        self._losses = 0
         self._counted = False
-        self._doubted = False
         self._ended_counts: Mapping[str, int] = {}
-        self._finder: threading.Thread | None = None
-        self._closing = threading.Event()
-        self._lock = threading.Lock()
-        self._link = self._new_link(device)
-        self._running = self._link
+        self._links = Reopening(device, self._ready_link, self._name)
+        self._running = self._links.newest
         """the one that the present run, or the last one, began on: a run does not survive a loss"""
 
     @property
@@ -83,7 +65,7 @@ class AravisCamera:
     @property
     def details(self) -> dict[str, Any]:
         """What else there is to know: packet counters, the clock's fit, what was switched off, losses."""
-        link = self._link
+        link = self._links.newest
         stream = link.stream
         clock: dict[str, Any] = {"latched": link.clock.latched}
         if len(link.clock):
@@ -95,7 +77,7 @@ class AravisCamera:
             "stream": dict(stream.counts() if stream is not None else self._ended_counts),
             "clock": clock,
             "switched_off": list(link.switched_off),
-            "losses": self._losses,
+            "losses": self._links.losses,
         }
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
@@ -103,7 +85,7 @@ class AravisCamera:
         self._check_open()
         if self._mode is not None:
             raise DeviceBusy("settings change while the camera is stopped", device=self._name, hint="stop it first")
-        link = self._present_link()
+        link = self._links.present()
         camera_settings.check(settings, self._limits, self._name)
         taken = link.call(lambda: self._put(link, settings))
         self._wanted = _merged(self._wanted, settings)
@@ -117,10 +99,12 @@ class AravisCamera:
         if mode not in self._capabilities.trigger_modes:
             has = ", ".join(sorted(mode.value for mode in self._capabilities.trigger_modes))
             raise ConfigError(f"no trigger mode {mode.value!r} on this camera", device=self._name, hint=f"it has {has}")
-        link = self._present_link()
+        link = self._links.present()
         link.call(lambda: self._begin(link, mode))
-        self._ids, self._doubted, self._running = FrameIds(), False, link
-        self._mode = mode
+        self._stamps = stamps.Stamps(
+            self._capabilities, self._present.exposure_ns, self._options, self._name, self._clock.now_ns()
+        )
+        self._ids, self._running, self._mode = FrameIds(), link, mode
 
     def trigger(self) -> None:
         """Start one exposure now; see `scanner.devices.Camera.trigger`."""
@@ -150,8 +134,8 @@ class AravisCamera:
                 raise link.loss()
             if left_s <= 0:
                 return None
-            if self._mode is not TriggerMode.SOFTWARE:
-                self._keep_clock(link)
+            if self._mode is not TriggerMode.SOFTWARE:  # between a trigger and its frame nothing is in the way of it
+                self._stamps.keep_clock(link, self._clock.now_ns())
 
     def execute(self, command: str) -> None:
         """Run a command of the camera's own, by its GenICam name.
@@ -160,7 +144,7 @@ class AravisCamera:
             DeviceError: it has no such command, or refuses.
         """
         self._check_open()
-        link = self._present_link()
+        link = self._links.present()
         link.call(lambda: link.features.execute(command))
 
     def check_setup(self, rate_hz: float | None = None) -> list[Finding]:
@@ -168,22 +152,21 @@ class AravisCamera:
 
         Empty for cameras on USB. See `network.check_network`.
         """
-        link = self._present_link()
-        fastest = 1e9 / self._capabilities.min_period_ns(self._present.exposure_ns)
+        link = self._links.present()
         if not link.is_gige:
             return []
-        return check_network(link.address, self._payload, rate_hz or fastest, self._packet_size)
+        return check_network(link.address, self._payload, rate_hz or self._fastest_hz, self._packet_size)
 
     def temperature_c(self) -> float | None:
         """Of the device (SFNC DeviceTemperature), degrees Celsius; None where it has no such feature."""
         self._check_open()
-        link = self._present_link()
+        link = self._links.present()
         return link.call(lambda: link.features.get_or_none("DeviceTemperature", float))
 
     def triggers_counted(self) -> int | None:
         """Triggers that the camera has counted since `start`, those included that gave no frame; None: it cannot."""
         self._check_open()
-        link = self._present_link()
+        link = self._links.present()
         return link.call(lambda: triggers.read_count(link.features)) if self._counted else None
 
     def stop(self) -> None:
@@ -206,20 +189,28 @@ class AravisCamera:
             return
         self.stop()
         self._open = False
-        self._closing.set()
-        with self._lock:
-            finder = self._finder
-        if finder is not None:
-            finder.join(timeout=CLOSED_S)
-        self._link.close()
+        self._links.close()
 
     # --- on the link's thread --------------------------------------------------------------------------------------
 
+    def _ready_link(self, device: str, on_lost: Callable[[str], None]) -> Link:
+        """An opened camera with the options and the settings wanted."""
+        link = Link(device, self._options, self._name, on_lost)
+        try:
+            link.call(lambda: self._prepare(link))
+        except BaseException:
+            link.close()
+            raise
+        return link
+
     def _put(self, link: Link, settings: CameraSettings) -> CameraSettings:
-        camera, features = link.camera, link.features
-        if settings != CameraSettings():
-            camera_settings.put(camera, features, settings, self._name)
-        return self._look(link).as_settings()
+        """Set what is given. What the camera did take of settings that it refuses in part is known all the same."""
+        try:
+            if settings != CameraSettings():
+                camera_settings.put(link.camera, link.features, settings, self._name)
+        finally:
+            present = self._look(link)
+        return present.as_settings()
 
     def _look(self, link: Link) -> camera_settings.Present:
         """Read everything anew, and declare what the camera can now."""
@@ -229,7 +220,7 @@ class AravisCamera:
         self._present = present
         self._payload = int(camera.get_payload())
         self._capabilities = camera_settings.capabilities(
-            present, self._limits, pace, self._modes, options, self._stamp(link)
+            present, self._limits, pace, self._modes, options, stamps.declared(link, options)
         )
         return present
 
@@ -243,8 +234,7 @@ class AravisCamera:
         camera_settings.choose_format(camera, self._limits, self._name)
         self._modes = triggers.offered_modes(features)
         triggers.set_mode(features, TriggerMode.FREE, options, self._name)
-        if features.has("AcquisitionFrameRateEnable"):
-            features.set_if_there("AcquisitionFrameRateEnable", False)
+        features.set_if_there("AcquisitionFrameRateEnable", False)
         self._packet_size = int(camera.gv_get_packet_size()) if link.is_gige else 0
         camera_settings.check(self._wanted, self._limits, self._name)
         self._put(link, self._wanted)
@@ -274,22 +264,25 @@ class AravisCamera:
             self._drop_stream(link)
             raise
 
+    @property
+    def _fastest_hz(self) -> float:
+        """Frames a second, as declared."""
+        return 1e9 / self._capabilities.min_period_ns(self._present.exposure_ns)
+
     def _set_rate(self, link: Link) -> None:
         """As asked, or no faster than declared: some cameras begin the next exposure during readout."""
-        features, wanted = link.features, self._options.frame_rate_hz
-        fastest = 1e9 / self._capabilities.min_period_ns(self._present.exposure_ns)
+        wanted, fastest = self._options.frame_rate_hz, self._fastest_hz
         shortest = camera_settings.shortest_period_ns(link.camera)
-        if wanted is not None and (shortest is None or wanted > fastest):
+        if shortest is None and wanted is not None:
+            raise ConfigError("the camera has no frame rate to set", device=self._name, hint="leave frame_rate_hz out")
+        if wanted is not None and wanted > fastest:
             raise ConfigError(
-                f"{wanted:g} frames a second are too many: at this exposure it gives {fastest:.4g}"
-                if shortest is not None
-                else "the camera has no frame rate to set",
+                f"{wanted:g} frames a second are too many: at this exposure it gives {fastest:.4g}",
                 device=self._name,
                 hint="lower frame_rate_hz, or expose for less",
             )
         if wanted is None and (shortest is None or 1e9 / shortest <= fastest * (1 + 1e-6)):
-            if features.has("AcquisitionFrameRateEnable"):
-                features.set_if_there("AcquisitionFrameRateEnable", False)
+            link.features.set_if_there("AcquisitionFrameRateEnable", False)
             return
         link.camera.set_frame_rate(wanted or fastest)
 
@@ -309,100 +302,15 @@ class AravisCamera:
         present = self._present
         _, _, width, height = present.region
         pixels = unpacked(received.content, (height, width), present.pixel_format)
-        self._keep_clock(link)
+        self._stamps.keep_clock(link, self._clock.now_ns())
+        exposure = self._stamps.exposure(link, received)
         trigger = None if received.trigger_count is None else received.trigger_count - 1
-        return CameraFrame(
-            pixels, self._ids.next(received.frame_id), self._exposure(link, received), received.complete, trigger
-        )
-
-    def _exposure(self, link: Link, received: Received) -> Exposure:
-        """The camera's stamp in our time. One that cannot be, or is worse than declared, is an estimate."""
-        caps = self._capabilities
-        length = self._present.exposure_ns + (caps.readout_ns if caps.shutter == "rolling" else 0)
-        at, bound = link.clock.host(received.device_ns)
-        start = at if self._options.stamp_at == "start" else at - length
-        source = caps.stamp
-        if bound > caps.stamp_bound_ns or start + length - bound > received.arrival_ns:
-            self._doubt(bound, start + length - received.arrival_ns)
-            source = Source.ESTIMATED
-            bound = max(bound, start + length - received.arrival_ns)
-        else:
-            bound = max(bound, min(LEAST_BOUND_NS, caps.stamp_bound_ns))
-        return Exposure(start, start + length, bound, source)
-
-    def _doubt(self, bound_ns: int, late_ns: int) -> None:
-        """Say once a run that stamps are not what was declared."""
-        if self._doubted or self._capabilities.stamp is Source.ESTIMATED:
-            return
-        self._doubted = True
-        why = f"is true to {bound_ns / 1e3:.0f} us only"
-        if late_ns > bound_ns:
-            why = f"says the exposure ended {late_ns / 1e3:.0f} us after its frame had come: try stamp_at"
-        _log.warning("%s: a stamp %s; such stamps are passed on as estimates", self._name, why)
-
-    def _keep_clock(self, link: Link) -> None:
-        """Compare the clocks now and then; between a software trigger and its frame nothing is in the way of it."""
-        now = self._clock.now_ns()
-        if now >= self._next_clock_ns:
-            self._next_clock_ns = now + CLOCK_EVERY_NS
-            link.post(lambda: link.read_clock(2))
-
-    def _stamp(self, link: Link) -> tuple[Source, int]:
-        if not link.clock.latched:
-            return Source.ESTIMATED, round(1e3 * self._options.arrival_bound_us)
-        link.read_clock()
-        # A stamp may be a second old when it is mapped, and no reading came meanwhile.
-        _, bound = link.clock.host(link.clock.newest_ns + STALE_NS)
-        return Source.HARDWARE, max(LEAST_BOUND_NS, BOUND_MARGIN * bound)
+        return CameraFrame(pixels, self._ids.next(received.frame_id), exposure, received.complete, trigger)
 
     def _give_back(self, stream: Stream) -> None:
         lent, self._lent = self._lent, None
         if lent is not None:
             stream.give_back(lent)
-
-    # --- loss ------------------------------------------------------------------------------------------------------
-
-    def _new_link(self, device: str) -> Link:
-        link = Link(device, self._options, self._name, self._lost)
-        try:
-            link.call(lambda: self._prepare(link))
-        except BaseException:
-            link.close()
-            raise
-        return link
-
-    def _present_link(self) -> Link:
-        link = self._link
-        if link.lost.is_set():
-            raise link.loss()
-        return link
-
-    def _lost(self, reason: str) -> None:
-        """Told by the watch, or by whoever met the silence first. The next link is another thread's work."""
-        _log.warning("%s: %s", self._name, reason)
-        with self._lock:
-            if self._closing.is_set() or self._finder is not None:
-                return
-            self._losses += 1
-            self._finder = threading.Thread(target=self._find_again, name="aravis finder", daemon=True)
-            self._finder.start()
-
-    def _find_again(self) -> None:
-        lost, pause_s = self._link, PAUSE_S
-        lost.close()
-        where = lost.address or self._device
-        while not self._closing.wait(pause_s):
-            pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
-            try:
-                link = self._new_link(where)
-            except ScannerError as error:
-                _log.debug("%s: still lost: %s", self._name, error)
-                continue
-            with self._lock:
-                self._finder = None
-                self._link = link
-            _log.info("%s: back", self._name)
-            return
 
     def _check_open(self) -> None:
         if not self._open:

@@ -8,7 +8,8 @@ from typing import Any
 from drivers.aravis.camera import AravisCamera
 from drivers.aravis.find import find_cameras
 from drivers.aravis.library import aravis
-from drivers.aravis.options import read_options
+from drivers.aravis.options import AravisOptions
+from drivers.option_table import read_options
 from scanner.clock import Clock
 from scanner.devices import DeviceInfo
 from scanner.errors import ConfigError
@@ -27,7 +28,7 @@ class AravisDriver:
             DeviceNotFound, DeviceBusy, PermissionDenied: it cannot be opened.
         """
         aravis()
-        return AravisCamera(device, read_options(options, device or DRIVER), clock)
+        return AravisCamera(device, read_options(AravisOptions, options, device or DRIVER), clock)
 
     def discover(self) -> Sequence[DeviceInfo]:
         """The cameras that answer; none where the library is missing."""

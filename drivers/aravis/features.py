@@ -6,6 +6,7 @@ camera lacks is no error unless somebody needs it; one that takes a value and ke
 
 from __future__ import annotations
 
+import logging
 import math
 import sys
 from collections.abc import Callable, Mapping
@@ -15,6 +16,7 @@ from drivers.aravis.library import is_library_error, translated
 from scanner.errors import ConfigError, DeviceError
 
 _T = TypeVar("_T")
+_log = logging.getLogger(__name__)
 
 AUTOMATIC: tuple[tuple[str, str | bool | float], ...] = (
     ("ExposureMode", "Timed"),
@@ -170,14 +172,26 @@ class Features:
             self.execute(command)
 
     def switch_off_automatics(self) -> list[str]:
-        """Everything of AUTOMATIC that the camera has; returns the names of those set, all of them read back."""
-        return [feature for feature, value in AUTOMATIC if self._set_of_its_kind(feature, value)]
+        """Everything of AUTOMATIC that the camera has; returns the names of those set, all of them read back.
+
+        One that is on and locked is warned of: it may change grey levels in the middle of a scan.
+        """
+        done = []
+        for feature, value in AUTOMATIC:
+            if not self.has(feature) or (self._is_choice(feature) and value not in self.entries(feature)):
+                continue
+            if self.writable(feature):
+                self._set_of_its_kind(feature, value)
+                done.append(feature)
+            elif (now := self.get(feature, type(value))) != value:
+                _log.warning("%s: %s is %r, and cannot be set to %r: greys may change", self._name, feature, now, value)
+        return done
 
     def set_further(self, features: Mapping[str, Any]) -> None:
         """Features of the rig file, by name.
 
         Raises:
-            ConfigError: the camera has no such feature, or the value is of the wrong kind.
+            ConfigError: the camera has no such feature, it cannot be set, or not to that value.
         """
         for feature, value in features.items():
             if not self.has(feature):
@@ -186,23 +200,28 @@ class Features:
                 )
             if not isinstance(value, str | bool | int | float):
                 raise ConfigError(f"features.{feature} is {value!r}: neither text nor number", device=self._name)
+            if not self.writable(feature):
+                raise ConfigError(
+                    f"features.{feature} cannot be set", device=self._name, hint="it is read-only, or locked by another"
+                )
+            if self._is_choice(feature) and value not in (choices := self.entries(feature)):
+                raise ConfigError(
+                    f"features.{feature} has no {value!r}", device=self._name, hint=f"it has {', '.join(choices)}"
+                )
             self._set_of_its_kind(feature, value)
 
-    def _set_of_its_kind(self, feature: str, value: str | bool | int | float) -> bool:
+    def _set_of_its_kind(self, feature: str, value: str | bool | int | float) -> None:
         """A number may be an integer for one camera and a float for another."""
-        if not self.writable(feature):
-            return False
-        if isinstance(value, str):
-            if value not in self.entries(feature) and self.entries(feature):
-                return False
-            self.set(feature, value)
-            return True
-        if isinstance(value, bool):
-            self.set(feature, value)
-            return True
-        node = type(self._device.get_feature(feature)).__name__
-        self.set(feature, int(value) if "Integer" in node or "Int" in node else float(value))
-        return True
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            value = int(value) if "Int" in self._node(feature) else float(value)
+        self.set(feature, value)
+
+    def _is_choice(self, feature: str) -> bool:
+        return "Enumeration" in self._node(feature)
+
+    def _node(self, feature: str) -> str:
+        """Name of its kind of node in the camera's description."""
+        return type(self._device.get_feature(feature)).__name__
 
     def _call(self, doing: str, feature: str, call: Callable[[], Any]) -> Any:
         try:

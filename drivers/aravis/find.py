@@ -132,10 +132,7 @@ def _not_opened(error: Exception, device: str) -> Exception:
     known = translated(error, device or "aravis", "opening the camera")
     text = known.message.lower()
     if isinstance(known, DeviceNotFound) or "not found" in text or "can't connect" in text:
-        try:
-            answers = ", ".join(f"{one.identity} ({one.address})" for one in find_cameras())
-        except ConfigError:
-            answers = ""
+        answers = ", ".join(f"{one.identity} ({one.address})" for one in find_cameras())
         return DeviceNotFound(
             f"no camera answers to {device!r}",
             device="aravis",

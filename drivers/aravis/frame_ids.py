@@ -11,13 +11,12 @@ class FrameIds:
 
     def __init__(self) -> None:
         self._last: int | None = None
-        self._wraps = 0
 
     def next(self, frame_id: int) -> int:
-        """The count that goes on. A step back of less than half the range is a late frame, not a wrap."""
-        if frame_id > ID_WRAP:  # extended ids have 64 bits
-            return frame_id
-        if self._last is not None and self._last - frame_id > ID_WRAP // 2:
-            self._wraps += 1
-        self._last = frame_id
-        return frame_id + self._wraps * ID_WRAP
+        """The count nearest to the last one: a small step back is a late frame, a large one a wrap."""
+        count = frame_id
+        if self._last is not None and frame_id <= ID_WRAP:  # extended ids have 64 bits
+            half = ID_WRAP // 2
+            count = self._last + (frame_id - self._last + half) % ID_WRAP - half
+        self._last = count
+        return count

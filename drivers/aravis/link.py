@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 from drivers.aravis.clock_fit import ClockFit
 from drivers.aravis.features import Features
 from drivers.aravis.find import open_camera
-from drivers.aravis.library import is_library_error, translated
-from drivers.aravis.options import Options
+from drivers.aravis.library import aravis, is_library_error, translated
+from drivers.aravis.options import AravisOptions
 from drivers.aravis.sockets import ControlSocket, udp_inodes
 from drivers.aravis.stream import Received, Stream
 from drivers.aravis.watch import CallProbe, GvcpProbe, Watch
@@ -43,7 +43,7 @@ _opening = threading.Lock()
 class Link:
     """An opened camera."""
 
-    def __init__(self, device: str, options: Options, name: str, on_lost: Callable[[str], None]) -> None:
+    def __init__(self, device: str, options: AravisOptions, name: str, on_lost: Callable[[str], None]) -> None:
         """Open it, and switch off everything automatic.
 
         Raises:
@@ -157,8 +157,6 @@ class Link:
         self._choose_clock()
 
     def _set_packets(self) -> None:
-        from drivers.aravis.library import aravis  # noqa: PLC0415
-
         camera, options = self._camera, self._options
         camera.gv_set_packet_size_adjustment(aravis().GvPacketSizeAdjustment.NEVER)
         if options.packet_size is None:

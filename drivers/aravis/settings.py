@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from drivers.aravis.features import Features
-from drivers.aravis.options import Options
+from drivers.aravis.options import AravisOptions
 from drivers.aravis.pixels import FORMATS, PixelFormat
 from scanner.devices import CameraCapabilities, CameraSettings, Source, TriggerMode
 from scanner.errors import ConfigError, DeviceError
@@ -52,7 +52,9 @@ def read_present(camera: Any, features: Features, name: str) -> Present:
     x, y, width, height = camera.get_region()
     text = camera.get_pixel_format_as_string()
     if text not in FORMATS:
-        raise DeviceError(f"pixel format {text!r} is none this driver knows", device=name)
+        raise DeviceError(
+            f"pixel format {text!r} is none this driver knows", device=name, hint=f"set one of: {', '.join(FORMATS)}"
+        )
     gain = float(camera.get_gain()) if camera.is_gain_available() else 0.0
     return Present(round(1e3 * camera.get_exposure_time()), gain, FORMATS[text], (x, y, width, height))
 
@@ -77,7 +79,7 @@ def read_limits(camera: Any, features: Features) -> Limits:
 
 
 def choose_format(camera: Any, limits: Limits, name: str) -> None:
-    """A format of ours, where the camera came up in another: the most bits that are not packed, grey before colour.
+    """A format of ours, where the camera came up in another: Mono8, or the first it has.
 
     Raises:
         ConfigError: the camera has none.
@@ -144,7 +146,7 @@ class Pace:
     shutter: Literal["global", "rolling"]
 
 
-def read_pace(camera: Any, features: Features, options: Options, exposure_ns: int) -> Pace:
+def read_pace(camera: Any, features: Features, options: AravisOptions, exposure_ns: int) -> Pace:
     """From what the camera says of its readout and its frame rate at the present exposure."""
     shutter = options.shutter
     if shutter == "auto":
@@ -175,7 +177,7 @@ def capabilities(
     limits: Limits,
     pace: Pace,
     modes: Sequence[TriggerMode],
-    options: Options,
+    options: AravisOptions,
     stamp: tuple[Source, int],
 ) -> CameraCapabilities:
     """What the camera can do, as the planner takes it."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.aravis.library import aravis, is_library_error
 from drivers.aravis.network import buffer_bytes
-from drivers.aravis.options import Options
+from drivers.aravis.options import AravisOptions
 from drivers.aravis.sockets import set_receive_buffer
 
 POP_US = 20_000
@@ -61,7 +61,7 @@ class Stream:
     def __init__(
         self,
         camera: Any,
-        options: Options,
+        options: AravisOptions,
         *,
         counted: bool,
         heard: Callable[[Received], None],
@@ -92,11 +92,6 @@ class Stream:
         self._thread = threading.Thread(target=self._receive, name="aravis frames", daemon=True)
         self._thread.start()
 
-    @property
-    def payload(self) -> int:
-        """Bytes of a frame."""
-        return self._payload
-
     def pop(self, timeout_s: float) -> Received | None:
         """The oldest frame; None if none came in that time, or the stream ended."""
         with self._came:
@@ -108,11 +103,6 @@ class Stream:
         """The frame's memory may be filled again."""
         if not self._ended:
             self._lend(received.buffer)
-
-    def wake(self) -> None:
-        """Let whoever waits in `pop` look up: the camera is lost."""
-        with self._came:
-            self._came.notify_all()
 
     def end(self) -> None:
         """Hand out no more frames; may be called from any thread."""
@@ -137,7 +127,7 @@ class Stream:
                 found[name] = int(stream.get_info_uint64(i))
         return {**found, "n_without_leader": self._without_leader}
 
-    def _configure(self, options: Options) -> None:
+    def _configure(self, options: AravisOptions) -> None:
         library, stream = aravis(), self._stream
         stream.set_property("socket-buffer", library.GvStreamSocketBuffer.FIXED)
         stream.set_property("socket-buffer-size", buffer_bytes(self._payload, options.socket_buffer_frames))
@@ -151,7 +141,8 @@ class Stream:
 
     def _lend(self, buffer: Any) -> None:
         buffer.set_frame_id(NO_LEADER)
-        self._stream.push_buffer(buffer)
+        if (stream := self._stream) is not None:  # closed on the link's thread meanwhile
+            stream.push_buffer(buffer)
 
     def _receive(self) -> None:
         stream, status = self._stream, aravis().BufferStatus

@@ -7,9 +7,9 @@ link's thread.
 from __future__ import annotations
 
 from drivers.aravis.features import Features
-from drivers.aravis.options import Options
+from drivers.aravis.options import AravisOptions
 from scanner.devices import TriggerMode
-from scanner.errors import ConfigError, DeviceError
+from scanner.errors import ConfigError
 
 SELECTORS = ("FrameStart", "ExposureStart", "FrameBurstStart", "AcquisitionStart")
 """What starts one frame, best first: cameras have different words for it"""
@@ -30,7 +30,7 @@ def offered_modes(features: Features) -> tuple[TriggerMode, ...]:
     return tuple(modes)
 
 
-def set_mode(features: Features, mode: TriggerMode, options: Options, name: str) -> str | None:
+def set_mode(features: Features, mode: TriggerMode, options: AravisOptions, name: str) -> str | None:
     """Set the mode; returns the trigger's source, None for free run.
 
     Raises:
@@ -54,11 +54,10 @@ def set_mode(features: Features, mode: TriggerMode, options: Options, name: str)
     return source
 
 
-def count_triggers(features: Features, source: str | None, options: Options) -> bool:
+def count_triggers(features: Features, source: str | None, options: AravisOptions) -> bool:
     """Let the camera count the source's edges and put the count into each frame; whether it can."""
-    if features.has("ChunkModeActive"):
-        features.set_if_there("ChunkModeActive", False)
-    event = _event(features, source)
+    features.set_if_there("ChunkModeActive", False)
+    event = _event(features, source, options)
     if not options.count_triggers or event is None or "CounterValue" not in _chunks(features):
         return False
     counter = next((one for one in COUNTERS if one in features.entries("CounterSelector")), None)
@@ -93,7 +92,7 @@ def _switch_off_all(features: Features) -> str | None:
     return next((one for one in SELECTORS if one in selectors), selectors[0])
 
 
-def _line(features: Features, options: Options, name: str) -> str:
+def _line(features: Features, options: AravisOptions, name: str) -> str:
     lines = [source for source in features.entries("TriggerSource") if source.startswith("Line")]
     wanted = options.trigger_line or lines[0]
     if wanted not in features.entries("TriggerSource"):
@@ -103,7 +102,7 @@ def _line(features: Features, options: Options, name: str) -> str:
     return wanted
 
 
-def _set_edge(features: Features, options: Options, name: str) -> None:
+def _set_edge(features: Features, options: AravisOptions, name: str) -> None:
     edges = features.entries("TriggerActivation")
     if edges and options.trigger_activation not in edges:
         raise ConfigError(
@@ -114,14 +113,16 @@ def _set_edge(features: Features, options: Options, name: str) -> None:
         low, high = features.bounds("TriggerDelay")
         if not low <= options.trigger_delay_us <= high:
             raise ConfigError(
-                f"a trigger delay of {options.trigger_delay_us:g} us lies outside {low:g} .. {high:g} us", device=name
+                f"a trigger delay of {options.trigger_delay_us:g} us lies outside {low:g} .. {high:g} us",
+                device=name,
+                hint="give a trigger_delay_us within these",
             )
         features.set("TriggerDelay", float(options.trigger_delay_us))
     elif options.trigger_delay_us:
-        raise DeviceError("the camera has no trigger delay", device=name, hint="leave trigger_delay_us out")
+        raise ConfigError("the camera has no trigger delay", device=name, hint="leave trigger_delay_us out")
 
 
-def _overlap(features: Features, options: Options, name: str) -> str:
+def _overlap(features: Features, options: AravisOptions, name: str) -> str:
     entries = features.entries("TriggerOverlap")
     if not options.overlap:
         return "Off"
@@ -131,13 +132,11 @@ def _overlap(features: Features, options: Options, name: str) -> str:
     return chosen
 
 
-def _event(features: Features, source: str | None) -> str | None:
+def _event(features: Features, source: str | None, options: AravisOptions) -> str | None:
+    """What the counter counts: the edges that fire the camera, under the name that this camera has for them."""
+    names = SOFTWARE_EVENTS if source == "Software" else (source, f"{source}{options.trigger_activation}")
     events = features.entries("CounterEventSource")
-    if source is None:
-        return None
-    if source != "Software":
-        return next((one for one in (source, f"{source}RisingEdge") if one in events), None)
-    return next((one for one in SOFTWARE_EVENTS if one in events), None)
+    return next((one for one in names if one in events), None)
 
 
 def _chunks(features: Features) -> list[str]:

@@ -47,7 +47,7 @@ class GvcpProbe:
 
     def __init__(self, address: str) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.connect((address, GVCP_PORT))
+        self._address = (address, GVCP_PORT)
         self._number = 0
 
     def alive(self, patience_s: float) -> bool:
@@ -56,6 +56,8 @@ class GvcpProbe:
         request = struct.pack(">BBHHHI", 0x42, 0x01, _READ_REGISTER, 4, self._number, CONTROL_PRIVILEGE)
         until = time.monotonic() + patience_s
         try:
+            # Each time: a network that went away and came back may have given this machine another address.
+            self._socket.connect(self._address)
             self._send(request)
             while (left := until - time.monotonic()) > 0:
                 self._socket.settimeout(left)
@@ -66,7 +68,7 @@ class GvcpProbe:
                 if status == 0 and command == _READ_REGISTER_ACK and len(answer) >= 12:
                     self._check_privilege(struct.unpack_from(">I", answer, 8)[0])
                 return True
-        except OSError:  # timed out, or the port is closed: nobody is there
+        except OSError:  # timed out, no way there, or the port is closed: nobody is there
             left = until - time.monotonic()
             if left > 0:
                 time.sleep(left)

@@ -19,7 +19,7 @@ from drivers.simulated.gige import GigeCamera, WireOptions
 from drivers.simulated.lines import Recorded
 from scanner.clock import MonotonicClock
 from scanner.devices import CameraFrame, CameraSettings, Source, TriggerMode
-from scanner.errors import ConfigError, DeviceBusy, DeviceLost, DeviceNotFound
+from scanner.errors import ConfigError, DeviceBusy, DeviceError, DeviceLost, DeviceNotFound
 
 pytest.importorskip("gi", reason="cameras behind Aravis need python3-gi (setup/packages.txt)")
 
@@ -130,7 +130,7 @@ def test_stamps_are_true_within_their_bounds(clock: str, source: Source) -> None
 
 
 def test_every_edge_on_the_line_gives_a_frame() -> None:
-    with pair({"features": {"TestLinePeriod": 8_333, "TestLinePulses": 36}}) as it:
+    with pair({"features": {"TestLinePeriod": 8_333, "TestLinePulses": 36, "DeviceUserID": "by the door"}}) as it:
         it.camera.start(TriggerMode.HARDWARE)
         it.camera.execute("TestLineStart")
         frames = it.frames(36)
@@ -229,6 +229,21 @@ def test_region_and_binning_show_their_part_of_the_picture() -> None:
         assert np.abs(it.frames(1)[0].pixels - halves).max() <= 0.5
 
 
+def test_settings_that_a_camera_takes_in_part_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The region is set and the gain is not: frames have the region that the camera has."""
+
+    def half(camera: Any, features: Any, settings: CameraSettings, name: str) -> None:
+        camera.set_region(*(settings.region or ()))
+        raise DeviceError("Gain is locked", device=name)
+
+    with pair() as it:
+        monkeypatch.setattr("drivers.aravis.settings.put", half)
+        with pytest.raises(DeviceError, match="Gain"):
+            it.camera.apply(CameraSettings(gain_db=6.0, region=(0, 0, 160, 100)))
+        it.camera.start(TriggerMode.FREE)
+        assert it.frames(1)[0].pixels.shape == (100, 160)
+
+
 def test_the_frame_rate_is_kept_or_refused() -> None:
     with pair({"frame_rate_hz": 40.0}) as it:
         it.camera.start(TriggerMode.FREE)
@@ -244,6 +259,8 @@ def test_options_that_the_camera_cannot_follow_are_refused() -> None:
     for options, said in (
         ({"features": {"NoSuchThing": 1}}, "NoSuchThing"),
         ({"features": {"Gain": [1]}}, "features.Gain"),
+        ({"features": {"GainAuto": "Sometimes"}}, "features.GainAuto has no 'Sometimes'"),
+        ({"features": {"SensorReadoutTime": 3.0}}, "features.SensorReadoutTime cannot be set"),
         ({"binning": 9}, "1 .. 4"),
     ):
         with pytest.raises(ConfigError, match=said), pair(options):

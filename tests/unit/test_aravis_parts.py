@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import sys
 import threading
 import time
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.aravis import camera_driver, library
+from drivers.aravis import camera_driver, library, reopening
 from drivers.aravis.clock_fit import CRYSTAL, ClockFit
 from drivers.aravis.frame_ids import FrameIds
 from drivers.aravis.network import buffer_bytes, check_buffer, check_network, interface_to
-from drivers.aravis.options import Options, read_options
+from drivers.aravis.options import AravisOptions
 from drivers.aravis.pixels import FORMATS, unpacked
-from drivers.aravis.watch import PROBES, Restarted, Watch
+from drivers.aravis.reopening import Reopening
+from drivers.aravis.triggers import count_triggers
+from drivers.aravis.watch import PROBES, GvcpProbe, Restarted, Watch
+from drivers.option_table import read_options
 from drivers.simulated.gige_features import PIXEL_FORMATS
 from drivers.simulated.gige_pixels import packed, payload_bytes
 from scanner.clock import MonotonicClock
 from scanner.devices import Interval
-from scanner.errors import ConfigError
+from scanner.errors import ConfigError, DeviceLost
 
 SECOND_NS = 1_000_000_000
 
@@ -131,34 +137,39 @@ def test_frame_ids_go_on_where_the_camera_begins_again() -> None:
     ids = FrameIds()
     told = [65_533, 65_534, 65_535, 1, 2, 5]
     assert [ids.next(each) for each in told] == [65_533, 65_534, 65_535, 65_536, 65_537, 65_540]
+    late = FrameIds()
+    assert [late.next(each) for each in (65_534, 1, 65_535, 2, 65_000)] == [65_534, 65_536, 65_535, 65_537, 65_000]
     extended = FrameIds()
     assert [extended.next(each) for each in (70_000, 70_001)] == [70_000, 70_001]
 
 
 def test_options_are_read_and_refused_by_name() -> None:
-    options = read_options({"packet_size": 9000, "line_latency_us": [5, 12], "features": {"Gamma": 1.0}}, "cam")
+    options = read_options(
+        AravisOptions, {"packet_size": 9000, "line_latency_us": [5, 12], "features": {"Gamma": 1.0}}, "cam"
+    )
     assert options.packet_size == 9000
     assert options.line_latency == Interval(5_000, 12_000)
-    assert read_options({}, "cam") == Options()
+    assert read_options(AravisOptions, {}, "cam") == AravisOptions()
 
 
 @pytest.mark.parametrize(
     ("table", "said"),
     [
         ({"packet_sise": 1}, "did you mean 'packet_size'"),
-        ({"packet_size": 1.5}, "a whole number"),
+        ({"packet_size": 1.5}, "packet_size"),
         ({"packet_size": 100}, "576"),
-        ({"resend": 1}, "true or false"),
-        ({"clock": "ptp"}, "auto, latch, arrival"),
+        ({"resend": 1}, "resend"),
+        ({"clock": "ptp"}, "'auto', 'latch' or 'arrival'"),
         ({"trigger_latency_us": [9, 3]}, "[low, high]"),
-        ({"features": 3}, "a table"),
-        ({"trigger_line": 1}, "a string"),
-        ({"frame_rate_hz": True}, "a number"),
+        ({"features": 3}, "features"),
+        ({"trigger_line": 1}, "trigger_line"),
+        ({"frame_rate_hz": True}, "frame_rate_hz"),
+        ({"loss_ms": float("nan")}, "loss_ms"),
     ],
 )
 def test_what_is_no_option_is_refused(table: dict[str, object], said: str) -> None:
     with pytest.raises(ConfigError) as raised:
-        read_options(table, "cam")
+        read_options(AravisOptions, table, "cam")
     assert said in f"{raised.value} {raised.value.hint}"
 
 
@@ -232,6 +243,109 @@ def test_frames_are_a_sign_of_life() -> None:
         time.sleep(0.008)
     assert told == []
     watch.close()
+
+
+def test_a_camera_that_no_network_leads_to_is_silent_and_no_error() -> None:
+    """As after its cable was pulled: the search for it must go on."""
+    probe = GvcpProbe("255.255.255.255")  # broadcasts are refused to a socket that has not asked for them
+    assert not probe.alive(0.01)
+    probe.close()
+
+
+# --- lost and found ---------------------------------------------------------------------------------------------------
+
+
+class FakeLink:
+    """A link as far as the search for a lost camera knows it."""
+
+    address = ""
+
+    def __init__(self, on_lost: Callable[[str], None]) -> None:
+        self.lost, self.closed, self._on_lost = threading.Event(), False, on_lost
+
+    def lose(self) -> None:
+        self.lost.set()
+        self._on_lost("gone")
+
+    def loss(self) -> DeviceLost:
+        return DeviceLost("gone")
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> tuple[list[FakeLink], Callable[..., Any]]:
+    """The links that were opened, and an opener; what is in `troubles` befalls the next ones."""
+    monkeypatch.setattr(reopening, "PAUSE_S", 0.001)
+    links: list[FakeLink] = []
+
+    def opener(device: str, on_lost: Callable[[str], None], troubles: list[str]) -> FakeLink:
+        trouble = troubles.pop(0) if troubles else ""
+        if trouble == "no network":
+            raise OSError(101, "Network is unreachable")
+        links.append(FakeLink(on_lost))
+        if trouble == "lost at once":
+            links[-1].lose()
+        return links[-1]
+
+    return links, opener
+
+
+def test_a_camera_lost_while_it_is_opened_is_not_looked_for(opened: tuple[list[FakeLink], Callable[..., Any]]) -> None:
+    links, opener = opened
+    with pytest.raises(DeviceLost):
+        Reopening("cam", functools.partial(opener, troubles=["lost at once"]), "cam")
+    assert [link.closed for link in links] == [True]
+    assert not [one for one in threading.enumerate() if one.name == "aravis finder"]
+
+
+def test_a_lost_camera_is_looked_for_whatever_befalls_the_search(
+    opened: tuple[list[FakeLink], Callable[..., Any]],
+) -> None:
+    links, opener = opened
+    hold = Reopening("cam", functools.partial(opener, troubles=["", "no network", "lost at once"]), "cam")
+    links[0].lose()
+    until = time.monotonic() + 5
+    while len(links) < 3 or hold.newest is not links[2]:
+        assert time.monotonic() < until
+        time.sleep(0.001)
+    assert hold.losses == 1
+    hold.close()
+    assert [link.closed for link in links] == [True] * 3
+
+
+# --- triggers ---------------------------------------------------------------------------------------------------------
+
+
+class FakeFeatures:
+    """A camera whose counter has an event for each kind of edge."""
+
+    def __init__(self) -> None:
+        self.values: dict[str, object] = {}
+
+    def has(self, feature: str) -> bool:
+        return True
+
+    def entries(self, feature: str) -> list[str]:
+        events = ["Line0RisingEdge", "Line0FallingEdge"]
+        return {"CounterEventSource": events, "ChunkSelector": ["CounterValue"]}.get(feature, [])
+
+    def set(self, feature: str, value: object) -> None:
+        self.values[feature] = value
+
+    def set_if_there(self, feature: str, value: object) -> None:
+        self.values[feature] = value
+
+    def execute_if_there(self, command: str) -> None:
+        self.values[command] = "executed"
+
+
+@pytest.mark.parametrize("edge", ["RisingEdge", "FallingEdge"])
+def test_the_edges_that_fire_the_camera_are_those_counted(edge: str) -> None:
+    features = FakeFeatures()
+    assert count_triggers(features, "Line0", AravisOptions(trigger_activation=edge))  # type: ignore[arg-type]
+    assert features.values["CounterEventSource"] == f"Line0{edge}"
 
 
 # --- without the library ----------------------------------------------------------------------------------------------
