@@ -16,6 +16,7 @@ from scanner.decode.mcp import (
     hmm,
     linking,
     magnification,
+    ranks,
     stripes,
     subpixel,
 )
@@ -369,3 +370,11 @@ def test_likelihoods_are_those_of_rayleigh_and_rice(model):
         density = (1 - emissions.OUTLIER) * np.where(mean == 0, off, on) + emissions.OUTLIER * flat
         dark = np.log(1e-4) if model.level[s] == 0 else 0
         np.testing.assert_allclose(found[:, s], np.log(density).sum(axis=1) + dark, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 100])
+def test_ranks_are_numpy_s(count):
+    values = np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32)
+    shares = (0.0, 0.01, 0.37, 0.99, 1.0)
+    np.testing.assert_allclose(ranks.quantiles(values, *shares), np.quantile(values, shares), rtol=1e-5, atol=1e-6)
+    assert ranks.median(values) == pytest.approx(float(np.median(values)), rel=1e-6)

@@ -103,13 +103,12 @@ def _signals(
                 base = valley[k] + (valley[other] - valley[k]) * t
                 x = 4 * column[k] + j
                 a, b = max(row - reach, 0), min(row + reach, height - 1)
-                total = np.float32(0)
-                high = 0
+                total, high = 0, 0
                 for r in range(a, b + 1):
-                    value = image[r, x]
-                    total += np.float32(value)
-                    high += 1 if value >= limit else 0
-                light[4 * p + j] = total / np.float32(b - a + 1) - base
+                    value = int(image[r, x])
+                    total += value
+                    high += value >= limit
+                light[4 * p + j] = np.float32(total) / np.float32(b - a + 1) - base
                 clipped[k] += np.float32(high) / np.float32(4 * (b - a + 1))
 
 

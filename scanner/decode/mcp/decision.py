@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scanner.decode.mcp import description, emissions, hmm, linking, magnification, stripes, subpixel
 from scanner.decode.mcp.locate import Array, Found, Stages
 from scanner.decode.mcp.model import PatternModel
+from scanner.decode.mcp.ranks import median
 
 ROUNDS = 2
 """Passes of columns and stripes over one another; a third changed no figure of the reference scenes by .001."""
@@ -108,4 +109,4 @@ def decide(found: Found, model: PatternModel, clock: Stages) -> Decision:
         "peaks_decided": int((label >= 0).sum()),
         "thresholds": {"decided": DECIDED, "min_chain_px": MIN_CHAIN_PX, "height_share": stripes.HEIGHT_FLOOR},
     }
-    return Decision(label, confidence, np.maximum(seen.light, 0), fine, agrees, float(np.median(scale_field)), figures)
+    return Decision(label, confidence, np.maximum(seen.light, 0), fine, agrees, median(scale_field), figures)

@@ -16,6 +16,7 @@ from scanner.decode.mcp.door import grey, turned, turned_back, upright_image, up
 from scanner.decode.mcp.locate import Array, Found, Image, Known, Stages, locate
 from scanner.decode.mcp.maps import fill_rows, maps_of
 from scanner.decode.mcp.model import PatternModel
+from scanner.decode.mcp.ranks import median
 from scanner.decode.mcp.white import RATIO_BITS, divided, in_grey_levels
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
@@ -172,7 +173,7 @@ def _learnt(found: Found, decided: Decision, *, upside_down: bool) -> Known:
         found.match,
         search,
         upside_down,
-        float(np.median(spacing)) if spacing.size else found.pitch,
+        median(spacing) if spacing.size else found.pitch,
         decided.magnification,
         decided.agreement.hits,
         float((label >= 0).mean()) if label.size else 0.0,

@@ -18,6 +18,7 @@ from scanner.decode.mcp.exponentials import exp_of, log_of
 from scanner.decode.mcp.linking import Chains
 from scanner.decode.mcp.magnification import FIELD_STEP
 from scanner.decode.mcp.model import PatternModel
+from scanner.decode.mcp.ranks import median, quantiles
 from scanner.decode.mcp.stripes import STEP
 from scanner.kernel import contracting_kernel, kernel, summing_kernel
 
@@ -231,7 +232,7 @@ def first_modulation(seen: Amplitudes, model: PatternModel) -> Array:
             continue
         quantile = 1 - share / 2
         expected = float(np.quantile(own, quantile, method="nearest"))
-        result[i] = np.quantile(seen.ratio[good, i], quantile) / max(expected, 1e-6)
+        result[i] = quantiles(seen.ratio[good, i], quantile)[0] / max(expected, 1e-6)
     return np.clip(result, MODULATION_FLOOR, MODULATION_TOP)
 
 
@@ -258,7 +259,7 @@ def refined_modulation(seen: Amplitudes, model: PatternModel, posterior: Array, 
         off = seen.ratio[on[:, i] < 0.1, i]
         if len(off) > 10:
             # Rayleigh: the median is 1.177 sigma. What texture adds here and there is in each fit's own residual.
-            floor[i] = np.clip(np.median(off) / 1.177, 0.008, 0.1)
+            floor[i] = np.clip(median(off) / 1.177, 0.008, 0.1)
     return modulation, floor
 
 

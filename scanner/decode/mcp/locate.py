@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from scanner.decode.mcp import carriers, linking, stripes
 from scanner.decode.mcp.model import PatternModel
+from scanner.decode.mcp.ranks import quantiles
 from scanner.patterns import CameraFormat
 
 Array = NDArray[np.float32]
@@ -128,7 +129,7 @@ def locate(image: Image, model: PatternModel, camera: CameraFormat, clock: Stage
     with clock.stage("columns"):
         found = Found(reduced=stripes.reduce_columns(image))
         found.noise = max(stripes.noise_of(found.reduced), 1e-3)
-    low, high = (float(v) for v in np.percentile(found.reduced[::4, ::4], (1, 99)))
+    low, high = quantiles(found.reduced[::4, ::4], 0.01, 0.99)
     if high - low < max(0.01 * camera.max_value, 6 * found.noise):
         state = "black" if high < 0.1 * camera.max_value else "saturated" if low > 0.9 * camera.max_value else "uniform"
         state = f"{state} but for noise of {found.noise:.1f}" if found.noise > 0.01 * camera.max_value else state

@@ -10,6 +10,11 @@ from scanner.decode.mcp import dense, stripes
 from scanner.decode.mcp.decision import Decision
 from scanner.decode.mcp.locate import Array, Found, Image, Stages
 from scanner.decode.mcp.model import PatternModel
+from scanner.decode.mcp.ranks import median
+
+MOST_UNEVEN = 0.4
+"""Pitches by which a cut stripe's valleys may lie nearer or further apart: keystone changes the pitch by a fifth to
+either side, and an edge takes as much again."""
 
 
 def maps_of(image: Image, found: Found, decided: Decision, model: PatternModel, clock: Stages) -> Decoded:
@@ -25,7 +30,7 @@ def maps_of(image: Image, found: Found, decided: Decision, model: PatternModel, 
     keep = label >= 0
     with clock.stage("dense rows"):
         maps = dense.interpolate(knots, (image.shape[0], image.shape[1]), found.pitch, model.pitch)
-        marked = dense.stripe_map(decided.fine.y, label, chains, (image.shape[0], image.shape[1]))
+        marked = dense.stripe_map(decided.fine.y, _named(found, decided), chains, (image.shape[0], image.shape[1]))
     with clock.stage("reasons"):
         reason = _reasons(found, decided, maps.rows)
     x = chains.column[keep] * float(stripes.STEP) + 1.5
@@ -80,6 +85,20 @@ def _knots(found: Found, decided: Decision, model: PatternModel) -> tuple[NDArra
     )
 
 
+def _named(found: Found, decided: Decision) -> NDArray[np.int32]:
+    """Stripe of each peak that has a name, -1 of the others: (P,) int32.
+
+    A stripe that an edge cuts on one side has its name all the same; where its middle lies is not known to a fraction
+    of a pixel, so that it gives no row. It is about as wide as a stripe is, or it is another one's remainder.
+    """
+    peaks = found.parts()[0]
+    whole, clear = decided.fine.whole > 0, peaks.clear > 0
+    width = (peaks.below - peaks.above) / found.pitch
+    inside = (peaks.y > 0) & (peaks.y < found.reduced.shape[1] - 1)
+    cut = (whole | clear) & inside & (np.abs(width - 1) < MOST_UNEVEN)
+    return np.where((whole & clear) | cut, decided.label, -1).astype(np.int32)
+
+
 def _reasons(found: Found, decided: Decision, rows: Array) -> NDArray[np.uint8]:
     """Why a pixel has no row: decided per column of four pixels by the nearest peak, (H, W) uint8."""
     peaks, chains, signals, _ = found.parts()
@@ -87,7 +106,7 @@ def _reasons(found: Found, decided: Decision, rows: Array) -> NDArray[np.uint8]:
     why[decided.label < 0] = Reason.UNWRAP_RISK
     why[signals.clipped > 0.5] = Reason.CLIPPED
     # Without a peak: dark is shadow, bright is too little modulation.
-    half_lit = np.median(peaks.valley) + 0.5 * np.median(peaks.height)
+    half_lit = median(peaks.valley) + 0.5 * median(peaks.height)
     small = np.where(half_lit < found.reduced, np.uint8(Reason.LOW_MODULATION), np.uint8(Reason.SHADOW))
     dense.spread(chains.column, peaks.y, why, int(0.6 * found.pitch), small)
     reason = np.empty(rows.shape, np.uint8)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
 
 from scanner.decode.mcp.model import PatternModel
+from scanner.decode.mcp.ranks import median, quantiles
 from scanner.kernel import kernel
 
 Array = NDArray[np.float32]
@@ -103,7 +104,7 @@ def noise_of(reduced: Array) -> float:
     """
     part = reduced[:: max(1, len(reduced) // 64)]
     second = part[:, 2:] - 2 * part[:, 1:-1] + part[:, :-2]
-    return float(np.median(np.abs(second)) * 1.4826 / np.sqrt(6))
+    return float(median(np.abs(second)) * 1.4826 / np.sqrt(6))
 
 
 def estimate_pitch(reduced: Array, model: PatternModel, count: int = 1) -> list[tuple[float, float]]:
@@ -176,7 +177,7 @@ def find_peaks(reduced: Array, pitch: float, carrier_px: float, noise: float, we
     heights = rows[:, 1]
     if not len(heights):
         return _as_peaks(start, rows)
-    floor = HEIGHT_FLOOR * float(np.percentile(heights, 99))
+    floor = HEIGHT_FLOOR * quantiles(heights, 0.99)[0]
     # The published pattern's modulated stripes are dim between two bright ones: those count by their neighbours.
     inner = np.ones(len(heights), bool)
     inner[start[:-1][start[:-1] < len(heights)]] = False
@@ -212,7 +213,7 @@ def spacing(peaks: Peaks) -> float:
     """Median distance of neighbouring peaks in a column, px; 0 where there are none."""
     apart = np.diff(peaks.y)
     apart = apart[apart > 0]  # not from the foot of one column to the head of the next
-    return float(np.median(apart)) if apart.size else 0.0
+    return median(apart) if apart.size else 0.0
 
 
 def _as_peaks(start: NDArray[np.int32], rows: Array) -> Peaks:
