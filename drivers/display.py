@@ -13,7 +13,7 @@ from pydantic import Field
 
 from drivers.option_table import Options
 from scanner.devices import Image, ProjectorCapabilities, ProjectorKind
-from scanner.errors import DeviceError
+from scanner.errors import ConfigError, DeviceError
 
 
 class DisplayOptions(Options):
@@ -37,6 +37,25 @@ class DisplayOptions(Options):
             modulation_period_ns=None if period is None else round(1e3 * period),
             scan=self.scan,
         )
+
+
+def read_mode(mode: str, device: str) -> tuple[tuple[int, int], float | None]:
+    """The size (width, height) and refresh rate, Hz, that a rig file's `projector.mode` asks for; None: any rate.
+
+    >>> read_mode("1920x1080@59.94", "display")
+    ((1920, 1080), 59.94)
+
+    Raises:
+        ConfigError: it is none.
+    """
+    size, _, rate = mode.partition("@")
+    try:
+        width, height = (int(part) for part in size.split("x"))
+        return (width, height), float(rate) if rate else None
+    except ValueError as error:
+        raise ConfigError(
+            f"mode {mode!r} makes no sense", device=device, hint='write "1920x1080" or "1920x1080@60"'
+        ) from error
 
 
 def check_images(images: Sequence[Image], shape: tuple[int, int], device: str) -> None:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
+from drivers.display import check_images, read_mode
 from drivers.option_table import Options, read_options
 from scanner.clock import Clock
 from scanner.devices import DeviceInfo, Flip, Image, Interval, ProjectorCapabilities, ProjectorKind, Source
@@ -81,14 +82,7 @@ class StaticProjector:
     def load(self, images: Sequence[Image]) -> None:
         """Check that the one image is the slide's; see `scanner.devices.Projector.load`."""
         self._check_open()
-        shape = (self._height, self._width)
-        for image in images:
-            if image.shape != shape or image.dtype != np.uint8:
-                raise DeviceError(
-                    f"the image is {image.dtype} of shape {image.shape}, the slide uint8 of shape {shape}",
-                    device=self._name,
-                    hint="size is that of the pattern on the slide",
-                )
+        check_images(images, (self._height, self._width), self._name)
         if len(images) > 1:
             raise DeviceError(
                 f"a slide holds one image, got {len(images)}",
@@ -155,13 +149,7 @@ def _size(options: StaticOptions, picture: Image | None, device: str) -> tuple[i
     if options.size is not None:
         told["size"] = options.size
     if options.mode is not None:
-        try:
-            width, height = options.mode.partition("@")[0].split("x")
-            told["mode"] = int(width), int(height)
-        except ValueError as error:
-            raise ConfigError(
-                f"mode {options.mode!r} makes no sense", device=device, hint='write "1024x768"'
-            ) from error
+        told["mode"], _ = read_mode(options.mode, device)
     if picture is not None:
         told["picture"] = picture.shape[1], picture.shape[0]
     if len(set(told.values())) > 1:

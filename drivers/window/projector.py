@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.display import DisplayOptions, check_images
+from drivers.display import DisplayOptions, check_images, read_mode
 from drivers.option_table import read_options
 from drivers.window import sdl
 from scanner.clock import Clock
@@ -183,9 +183,9 @@ def _find(seen: list[sdl.Display], device: str) -> sdl.Display:
 def _check_mode(options: WindowOptions, size: tuple[int, int], hz: int, device: str) -> None:
     if options.mode is None:
         return
-    wanted, _, rate = options.mode.partition("@")
+    wanted, rate = read_mode(options.mode, device)
     # Desktops round rates to whole Hz: 59.94 is told as 60 or 59.
-    if wanted != f"{size[0]}x{size[1]}" or (rate and abs(float(rate) - hz) > 1):
+    if wanted != size or (rate is not None and abs(rate - hz) > 1):
         raise ConfigError(
             f"the desktop shows {size[0]}x{size[1]}@{hz} there, and not {options.mode}",
             device=device,

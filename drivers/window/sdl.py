@@ -55,6 +55,7 @@ class Display:
 
     index: int
     name: str
+    """of the monitor; empty where the desktop knows none"""
     x: int
     y: int
     width: int
@@ -146,6 +147,8 @@ def displays(sdl: ctypes.CDLL) -> Iterator[Display]:
         if sdl.SDL_GetDisplayBounds(index, bounds) or sdl.SDL_GetDesktopDisplayMode(index, mode):
             continue
         name = (sdl.SDL_GetDisplayName(index) or b"").decode(errors="replace")
+        if name == str(index):  # SDL's stand-in for a display without a name
+            name = ""
         yield Display(index, name, bounds.x, bounds.y, bounds.w, bounds.h, mode.refresh_rate)
 
 
@@ -159,7 +162,10 @@ class Picture:
         if not self.texture:
             raise DeviceError(f"no room for an image: {problem(sdl)}", device="window")
         words = image.astype(np.uint32) * np.uint32(_GREY) | np.uint32(_OPAQUE)
-        sdl.SDL_UpdateTexture(self.texture, None, words.ctypes.data, 4 * width)
+        if sdl.SDL_UpdateTexture(self.texture, None, words.ctypes.data, 4 * width):
+            message = problem(sdl)
+            self.free()
+            raise DeviceError(f"an image cannot be loaded: {message}", device="window")
 
     def free(self) -> None:
         """Give the memory back."""

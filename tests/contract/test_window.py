@@ -75,11 +75,18 @@ def test_the_whole_display_is_taken_and_greys_are_exact() -> None:
 
 
 def test_displays_are_listed_and_others_are_refused() -> None:
-    assert [info.details["size"] for info in projector_driver.discover()] == ["800x600"]
+    assert [(info.model, info.details["size"]) for info in projector_driver.discover()] == [("screen", "800x600")]
     with pytest.raises(DeviceNotFound, match="no display '3'"):
         _open("3")
     with pytest.raises(ConfigError, match="800x600"):
         _open(mode="1920x1080@60")
+    with pytest.raises(ConfigError, match="'800x600@fast' makes no sense"):
+        _open(mode="800x600@fast")
+
+
+def test_a_display_without_a_name_is_not_called_by_its_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    assert [(info.device, info.model) for info in projector_driver.discover()] == [("0", "display of the desktop")]
 
 
 def test_without_a_desktop_there_is_a_hint(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,6 +95,16 @@ def test_without_a_desktop_there_is_a_hint(monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(DeviceNotFound) as caught:
         _open()
     assert "kms" in (caught.value.hint or "")
+
+
+def test_an_image_that_does_not_reach_the_renderer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    projector = _open(windowed=[64, 48])
+    try:
+        monkeypatch.setattr(projector.window._sdl, "SDL_UpdateTexture", lambda *_: -1)
+        with pytest.raises(DeviceError, match="cannot be loaded"):
+            projector.load([np.zeros((48, 64), dtype=np.uint8)])
+    finally:
+        projector.close()
 
 
 def test_a_window_that_was_closed_is_lost() -> None:
