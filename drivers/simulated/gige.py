@@ -21,11 +21,12 @@ from drivers.simulated import gige_registers as r
 from drivers.simulated.faults import CameraFaults
 from drivers.simulated.gige_control import PORT, Control
 from drivers.simulated.gige_registers import Identity, Refused, Registers
-from drivers.simulated.gige_sensor import DeviceClock, Sensor
+from drivers.simulated.gige_sensor import Sensor
 from drivers.simulated.gige_stream import Stream, StreamCounts
+from drivers.simulated.gige_time import DeviceClock
 from drivers.simulated.lines import Regular
 from drivers.simulated.options import Settings, read_settings
-from drivers.simulated.world import NOMINAL_EXPOSURE_NS, World, enter_world
+from drivers.simulated.world import NOMINAL_EXPOSURE_NS, enter_world
 from scanner.clock import Clock
 from scanner.errors import ConfigError, DeviceBusy
 
@@ -78,7 +79,6 @@ class GigeCamera:
         self.world = enter_world(self._settings, clock, self.name)
         self.world.hold("camera", self, self.name)
         self._clock = clock
-        self._lock = threading.Lock()
         self._silent = False
         self._dead = threading.Event()
         self._sockets: list[socket.socket] = []
@@ -162,7 +162,7 @@ class GigeCamera:
         self._ticks = DeviceClock(wire.tick_hz, offset, wire.clock_ppm, self._clock.now_ns())
         self._sensor = Sensor(self.world, settings.camera, registers, self._stream, self._ticks, wire.queue)
         registers.set_number(f.EXPOSURE_TIME, NOMINAL_EXPOSURE_NS // 1000)
-        registers.set_number(f.READOUT_TIME, self._sensor.readout_ns / 1e3)
+        registers.set_number(f.READOUT_TIME, settings.camera.readout_us)
         registers.set_word(r.STREAM_SOURCE_PORT, self._stream.source_port)
         self._control = Control(registers, self._stream.resend, self._released, self._clock.now_ns)
         self._wire_registers(registers)
@@ -224,7 +224,7 @@ class GigeCamera:
             registers.set_word(offset_most, limit - registers.word(side))
             registers.set_word(offset, min(registers.word(offset), limit - registers.word(side)))
         registers.set_word(f.PAYLOAD_SIZE, self._sensor.payload_size())
-        shortest_s = registers.number(f.EXPOSURE_TIME) * 1e-6 + self._sensor.gap_ns * 1e-9
+        shortest_s = registers.number(f.EXPOSURE_TIME) * 1e-6 + self._settings.camera.gap_ns * 1e-9
         registers.set_number(f.FRAME_RATE_MAX, 1.0 / shortest_s)
         if not registers.number(f.FRAME_RATE) or registers.number(f.FRAME_RATE) > 1.0 / shortest_s:
             registers.set_number(f.FRAME_RATE, 1.0 / shortest_s)
@@ -301,6 +301,3 @@ def _sockets(address: str, name: str) -> list[socket.socket]:
         return [own, everybody]
     everybody.close()
     return [own]
-
-
-__all__ = ["GigeCamera", "WireOptions", "World"]

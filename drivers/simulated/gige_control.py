@@ -91,25 +91,24 @@ class Control:
             self._release()
 
     def _obey(self, command: int, body: bytes) -> bytes:
-        match command:
-            case 0x02:
-                return self._registers.read(0, r.DISCOVERY_BYTES)
-            case 0x80:
-                return b"".join(self._read(address, 4) for (address,) in struct.iter_unpack(">I", body))
-            case 0x82:
-                pairs = list(struct.iter_unpack(">I4s", body))
-                for address, content in pairs:
-                    self._write(address, content)
-                return struct.pack(">HH", 0, len(pairs))
-            case 0x84:
-                address, _, count = struct.unpack(">IHH", body)
-                if count > MEMORY_BYTES:
-                    raise Refused(r.INVALID_PARAMETER)
-                return bytes(body[:4]) + self._read(address, count)
-            case 0x86:
-                (address,) = struct.unpack_from(">I", body)
-                self._write(address, body[4:])
-                return struct.pack(">HH", 0, len(body) - 4)
+        if command == DISCOVERY:
+            return self._registers.read(0, r.DISCOVERY_BYTES)
+        if command == READ_REGISTER:
+            return b"".join(self._read(address, 4) for (address,) in struct.iter_unpack(">I", body))
+        if command == WRITE_REGISTER:
+            pairs = list(struct.iter_unpack(">I4s", body))
+            for address, content in pairs:
+                self._write(address, content)
+            return struct.pack(">HH", 0, len(pairs))
+        if command == READ_MEMORY:
+            address, _, count = struct.unpack(">IHH", body)
+            if count > MEMORY_BYTES:
+                raise Refused(r.INVALID_PARAMETER)
+            return body[:4] + self._read(address, count)
+        if command == WRITE_MEMORY:
+            (address,) = struct.unpack_from(">I", body)
+            self._write(address, body[4:])
+            return struct.pack(">HH", 0, len(body) - 4)
         raise Refused(NOT_IMPLEMENTED)
 
     def _read(self, address: int, size: int) -> bytes:

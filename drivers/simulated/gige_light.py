@@ -20,6 +20,7 @@ import struct
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import cast
@@ -94,13 +95,19 @@ class LightRelay:
             raise ConfigError(answer["error"], device=self._name, hint="name the same rig for camera and projector")
 
     def _tell(self, t_ns: float, image: LoadedImage | None) -> None:
+        with self._connected():
+            if self._socket is None:
+                self._connect()
+            link = cast("socket.socket", self._socket)
+            slot = -1 if image is None else self._slot(link, image)
+            _send(link, b"S", struct.pack(">qi", round(t_ns), slot))
+
+    @contextlib.contextmanager
+    def _connected(self) -> Iterator[None]:
+        """One thread at a time sends. What fails may have sent half a message: the next flip connects again."""
         with self._lock:
             try:
-                if self._socket is None:
-                    self._connect()
-                link = cast("socket.socket", self._socket)
-                slot = -1 if image is None else self._slot(link, image)
-                _send(link, b"S", struct.pack(">qi", round(t_ns), slot))
+                yield
             except OSError as error:
                 _log.debug("%s: its camera does not listen: %s", self._name, error)
                 self._drop()
@@ -131,7 +138,7 @@ class LightRelay:
             edges = sorted((edge, name) for name in _TOLD_LINES for edge in self._edges(name, seen, now))
             seen = now
             for edge, name in edges:
-                with self._lock, contextlib.suppress(OSError):  # the next flip notices, and connects again
+                with self._connected():
                     if self._socket is not None:
                         _send(self._socket, b"E", struct.pack(">q", edge) + name.encode())
 
@@ -166,6 +173,9 @@ class LightReceiver:
         before = os.umask(0o177)
         try:
             self._listener.bind(str(path))
+        except OSError as error:  # longer than the kernel allows, or in a folder of somebody else's
+            self._listener.close()
+            raise ConfigError(f"no socket can be made at {path}: {error}", hint="give another --light") from error
         finally:
             os.umask(before)
         self._listener.listen(1)
@@ -189,7 +199,7 @@ class LightReceiver:
             with contextlib.closing(link):
                 try:
                     self._hear(link)
-                except (OSError, EOFError, ValueError, KeyError, struct.error) as error:
+                except (OSError, EOFError, ValueError, KeyError, TypeError, struct.error) as error:
                     _log.info("the projector is gone: %s", error)
             self._world.timeline.show(time.monotonic_ns(), None)
 

@@ -66,7 +66,7 @@ class Identity:
 
 
 class Registers:
-    """The camera's memory. One lock for all is held by the caller."""
+    """The camera's memory: written by the thread that answers the client."""
 
     def __init__(self, identity: Identity, size: tuple[int, int]) -> None:
         self._bootstrap = bytearray(BOOTSTRAP_BYTES)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 import struct
 import threading
-from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass
 from typing import Any, cast
@@ -23,6 +22,7 @@ from drivers.simulated import gige_features as f
 from drivers.simulated.gige_pixels import BITS, binned, packed, payload_bytes
 from drivers.simulated.gige_registers import Refused, Registers
 from drivers.simulated.gige_stream import Picture, Stream
+from drivers.simulated.gige_time import REMEMBERED, DeviceClock, Edges
 from drivers.simulated.lines import Line, LineName
 from drivers.simulated.options import CameraOptions
 from drivers.simulated.world import World
@@ -30,26 +30,10 @@ from scanner.devices import Pixels
 
 BUSY = 0x8007
 LONGEST_WAIT_S = 0.1
-REMEMBERED = 1024
 AUTOMATIC_SHARE = 0.2
 """An automatic function that was left on makes exposures wander by this share"""
 LINE_WAIT_S = 0.001
 """Between two looks at a line of the world, whose edges are found when they are past"""
-
-
-@dataclass(frozen=True)
-class DeviceClock:
-    """The camera's own clock: another origin, another rate."""
-
-    tick_hz: int
-    offset_ticks: int
-    ppm: float
-    epoch_ns: int
-
-    def ticks(self, t_ns: int) -> int:
-        """Its reading at a time of CLOCK_MONOTONIC."""
-        passed = (t_ns - self.epoch_ns) * (1.0 + self.ppm * 1e-6)
-        return self.offset_ticks + round(passed * self.tick_hz / 1e9)
 
 
 @dataclass(frozen=True)
@@ -93,10 +77,7 @@ class Sensor:
         self._changed = threading.Condition()
         self._setting: _Setting | None = None
         self._shots: deque[_Shot] = deque()
-        self._line_edges: list[int] = []
-        self._frame_triggers: list[int] = []
-        self._exposures: list[int] = []
-        self._counter_from_ns = 0
+        self._line_edges, self._frame_triggers, self._exposures = Edges(), Edges(), Edges()
         self._idle_ns = self._next_free_ns = 0
         self._numbers = 0
         self._block = 0
@@ -140,7 +121,7 @@ class Sensor:
     def pulse(self, t_ns: int) -> None:
         """A rising edge on Line1 at `t_ns`. Edges come in the order of their times."""
         with self._changed:
-            self._line_edges.append(t_ns)
+            self._line_edges.add(t_ns)
         self._trigger(t_ns, f.LINE1_SOURCE)
 
     def listen(self, line: Line) -> None:
@@ -151,12 +132,13 @@ class Sensor:
 
     def reset_counter(self) -> None:
         """CounterReset."""
-        self._counter_from_ns = self._clock.now_ns()
+        for seen in (self._line_edges, self._frame_triggers, self._exposures):
+            seen.reset(self._clock.now_ns())
 
     def counter(self, at_ns: int, source: int) -> int:
         """What the counter stands at."""
-        seen = {1: self._line_edges, 2: self._frame_triggers, 3: self._exposures}.get(source, [])
-        return bisect_right(seen, at_ns) - bisect_right(seen, self._counter_from_ns - 1)
+        seen = {1: self._line_edges, 2: self._frame_triggers, 3: self._exposures}.get(source)
+        return 0 if seen is None else seen.count(at_ns)
 
     def close(self) -> None:
         """End the thread."""
@@ -173,7 +155,7 @@ class Sensor:
             setting = self._setting
             if setting is None or not setting.triggered or setting.source != source:
                 return
-            self._frame_triggers.append(t_ns)
+            self._frame_triggers.add(t_ns)
             software = source == f.SOFTWARE_SOURCE
             latency_us = self._options.trigger_latency_us if software else self._options.line_latency_us
             start = t_ns + setting.delay_ns + round(1e3 * latency_us)
@@ -195,9 +177,9 @@ class Sensor:
             exposure_ns = round(exposure_ns * (1.0 + AUTOMATIC_SHARE * math.sin(self._numbers)))
         self._shots.append(_Shot(start_ns, exposure_ns, self._numbers))
         if setting.counter == f.COUNTER_SOURCES["ExposureStart"]:
-            self._exposures.append(start_ns)
+            self._exposures.add(start_ns)
         self._numbers += 1
-        self._idle_ns = start_ns + exposure_ns + self.gap_ns
+        self._idle_ns = start_ns + exposure_ns + self._options.gap_ns
 
     def _begin_free(self, now_ns: int, setting: _Setting) -> None:
         """Exposures that began by now; while all buffers are full the sensor waits."""
@@ -242,7 +224,7 @@ class Sensor:
 
     def _wait_ns(self, now_ns: int, setting: _Setting | None, shot: _Shot | None) -> float:
         """Until there is something to do."""
-        times = [] if shot is None else [shot.start_ns + shot.exposure_ns + self._rolling_ns]
+        times = [] if shot is None else [shot.start_ns + shot.exposure_ns + self._options.rolling_ns]
         if setting is not None and not setting.triggered and len(self._shots) < self._options.buffers:
             times.append(self._next_free_ns)
         return min((t - now_ns for t in times), default=1e9 * LONGEST_WAIT_S)
@@ -256,7 +238,7 @@ class Sensor:
         else:
             frame = self._render(shot.start_ns, shot.exposure_ns, setting, shot.number)
         content = self._payload(frame, shot, setting)
-        ready = shot.start_ns + shot.exposure_ns + self.readout_ns
+        ready = shot.start_ns + shot.exposure_ns + self._options.readout_ns
         self._clock.sleep_until(ready)
         with self._changed:
             if self._setting is not setting or not self._shots or self._shots[0] is not shot:
@@ -288,13 +270,15 @@ class Sensor:
         width, height = self._world.rig.calibration.camera.size
         for kind, bits in ((np.uint8, 8), (np.uint16, 12)):
             scratch: Any = np.empty((height, width), dtype=kind)
-            self._world.render(self._clock.now_ns() - 1_000_000, 1_000_000, self._rolling_ns, 0.0, bits, 0, scratch)
+            self._world.render(
+                self._clock.now_ns() - 1_000_000, 1_000_000, self._options.rolling_ns, 0.0, bits, 0, scratch
+            )
 
     def _render(self, start_ns: int, exposure_ns: int, setting: _Setting, number: int) -> Pixels:
         width, height = self._world.rig.calibration.camera.size
         bits = BITS[setting.pixel_format]
         frame: Any = np.empty((height, width), dtype=np.uint8 if bits <= 8 else np.uint16)
-        self._world.render(start_ns, exposure_ns, self._rolling_ns, setting.gain_db, bits, number, frame)
+        self._world.render(start_ns, exposure_ns, self._options.rolling_ns, setting.gain_db, bits, number, frame)
         if setting.gamma != 1.0:
             top = (1 << bits) - 1
             table = np.round(top * (np.arange(top + 1) / top) ** setting.gamma).astype(frame.dtype)
@@ -319,21 +303,6 @@ class Sensor:
 
     # --- settings ------------------------------------------------------------------------------------------------
 
-    @property
-    def readout_ns(self) -> int:
-        """Duration of the readout."""
-        return round(1e3 * self._options.readout_us)
-
-    @property
-    def gap_ns(self) -> int:
-        """From the end of one exposure to the start of the next, at least."""
-        gap = self._options.min_gap_us
-        return self.readout_ns if gap is None else round(1e3 * gap)
-
-    @property
-    def _rolling_ns(self) -> int:
-        return self.readout_ns if self._options.shutter == "rolling" else 0
-
     def payload_size(self) -> int:
         """Bytes of a frame with the present registers."""
         registers = self._registers
@@ -352,7 +321,7 @@ class Sensor:
     def _read_setting(self) -> _Setting:
         word, number = self._registers.word, self._registers.number
         exposure = round(1e3 * number(f.EXPOSURE_TIME))
-        shortest = exposure + self.gap_ns
+        shortest = exposure + self._options.gap_ns
         slowed = word(f.FRAME_RATE_ENABLE) and number(f.FRAME_RATE) > 0
         asked = round(1e9 / number(f.FRAME_RATE)) if slowed else round(1e3 * (self._options.period_us or 0.0))
         width, height = word(f.WIDTH), word(f.HEIGHT)
@@ -381,9 +350,7 @@ class Sensor:
         self._ring = []
         self._own_line = None
         self._shots.clear()
-        self._frame_triggers.clear()
-        self._exposures.clear()
-        self._line_edges.clear()
+        self._line_edges, self._frame_triggers, self._exposures = Edges(), Edges(), Edges()
         self._block = 0
         self.dropped_triggers = 0
         self.true_starts = {}

@@ -65,6 +65,28 @@ class CameraOptions:
     period_us: float | None = field(default=None, metadata={"low": 0.0, "high": 1e8})
     """FREE: time between frames; with `ring`, 0 gives them as fast as asked. None: the shortest possible"""
 
+    @property
+    def readout_ns(self) -> int:
+        """Duration of the readout."""
+        return round(1e3 * self.readout_us)
+
+    @property
+    def rolling_ns(self) -> int:
+        """From the first row's start to the last row's; 0 for a global shutter."""
+        return self.readout_ns if self.shutter == "rolling" else 0
+
+    @property
+    def gap_ns(self) -> int:
+        """From the end of one exposure to the start of the next, at least."""
+        return self.readout_ns if self.min_gap_us is None else round(1e3 * self.min_gap_us)
+
+    def period_ns(self, exposure_ns: int) -> int:
+        """Between the starts of two free-running exposures."""
+        shortest = exposure_ns + self.gap_ns
+        if self.period_us is None:
+            return shortest
+        return max(round(1e3 * self.period_us), 1 if self.ring else shortest)
+
 
 @dataclass(frozen=True)
 class ProjectorOptions:

@@ -115,16 +115,13 @@ class SimulatedProjector:
         self._check_open()
         if not 0 <= index < len(self._images):
             raise DeviceError(f"image {index} is not loaded, there are {len(self._images)}", device=self._name)
-        if self._faults.unplug_after is not None and self._flips_since_open >= self._faults.unplug_after:
-            raise DeviceLost("the display went away", device=self._name, hint="plug it in again and repeat the scan")
-        refresh = self._options.refresh_ns
-        vblank = max((self._clock.now_ns() - self._first_vblank_ns) // refresh, self._last_vblank) + 1
-        t_ns = self._first_vblank_ns + vblank * refresh
+        vblank = self._next_vblank()
+        t_ns = self._first_vblank_ns + vblank * self._options.refresh_ns
         self._clock.sleep_until(t_ns)
         self._change(t_ns, index)
         self._last_vblank = vblank
         self._flips_since_open += 1
-        return Flip(t_ns, int(vblank), STAMP_BOUND_NS, Source.HARDWARE)
+        return Flip(t_ns, vblank, STAMP_BOUND_NS, Source.HARDWARE)
 
     def close(self) -> None:
         """Leave a black screen and give the device back."""
@@ -140,6 +137,13 @@ class SimulatedProjector:
     def _check_open(self) -> None:
         if not self._open:
             raise DeviceError("the projector is closed", device=self._name)
+
+    def _next_vblank(self) -> int:
+        """Count of the next vertical blank that nothing was flipped at; DeviceLost if the display is unplugged."""
+        if self._faults.unplug_after is not None and self._flips_since_open >= self._faults.unplug_after:
+            raise DeviceLost("the display went away", device=self._name, hint="plug it in again and repeat the scan")
+        passed = (self._clock.now_ns() - self._first_vblank_ns) // self._options.refresh_ns
+        return int(max(passed, self._last_vblank)) + 1
 
     def _change(self, t_ns: int, index: int) -> None:
         """Put the change of light of this flip onto the timeline, as far as faults let it."""

@@ -18,7 +18,7 @@ from drivers.simulated.projector import STAMP_BOUND_NS, SimulatedProjector
 from drivers.simulated.timeline import LoadedImage
 from drivers.simulated.world import World
 from scanner.devices import Flip, Image, Source, TableSlot
-from scanner.errors import ConfigError, DeviceError, DeviceLost
+from scanner.errors import ConfigError, DeviceError
 
 PLANES = 3
 """Patterns in a video frame: 8-bit greys in red, green and blue"""
@@ -95,14 +95,11 @@ class SimulatedSequencedProjector(SimulatedProjector):
         self._check_open()
         if not self._table:
             raise DeviceError("nothing is programmed", device=self._name, hint="load a table before starting")
-        if self._faults.unplug_after is not None and self._flips_since_open >= self._faults.unplug_after:
-            raise DeviceLost("the display went away", device=self._name, hint="plug it in again and repeat the scan")
-        refresh = self._options.refresh_ns
-        vblank = max((self._clock.now_ns() - self._first_vblank_ns) // refresh, self._last_vblank) + 1
+        refresh, vblank = self._options.refresh_ns, self._next_vblank()
         self._begun = []
         for i, (slot, placed) in enumerate(zip(self._table, _placed(self._table, refresh), strict=True)):
             begins = self._first_vblank_ns + (vblank + placed.refresh) * refresh + placed.offset_ns
-            self._begun.append(Flip(begins, int(vblank + placed.refresh), STAMP_BOUND_NS, Source.HARDWARE))
+            self._begun.append(Flip(begins, vblank + placed.refresh, STAMP_BOUND_NS, Source.HARDWARE))
             self._light(i, slot, begins + round(self._latency_ns))
             self._last_vblank = vblank + placed.refresh
             self._flips_since_open += 1

@@ -7,11 +7,14 @@ VSYNC is the projector's vertical blank, EXT the projector's trigger output.
 
 from __future__ import annotations
 
+import functools
+import threading
 from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any, TypeVar, cast
 
-from drivers.simulated.lines import Line, LineName
+from drivers.simulated.lines import REMEMBERED, Line, LineName
 from drivers.simulated.options import Settings
 from drivers.simulated.table_run import Step, TableRun
 from drivers.simulated.world import World
@@ -27,12 +30,26 @@ EMITS = 1
 
 _RANDOM_USE = 4
 
+_Method = TypeVar("_Method", bound=Callable[..., Any])
+
+
+def _one_at_a_time(method: _Method) -> _Method:
+    """The light relay looks at the board's line from a thread of its own, and looking reckons the run further."""
+
+    @functools.wraps(method)
+    def alone(self: SimulatedTriggerBoard, *given: Any) -> Any:
+        with self._lock:
+            return method(self, *given)
+
+    return cast("_Method", alone)
+
 
 class SimulatedTriggerBoard:
     """A board in a simulated world; see `scanner.devices.TriggerBoard`."""
 
     def __init__(self, world: World, settings: Settings, name: str) -> None:
         world.hold("trigger", self, name)
+        self._lock = threading.RLock()
         self._world = world
         self._clock = world.clock
         self._name = name
@@ -65,12 +82,14 @@ class SimulatedTriggerBoard:
         """What it can do."""
         return replace(CAPABILITIES, event_bound_ns=round(1e3 * self._options.stamp_bound_us))
 
+    @_one_at_a_time
     def program(self, table: Sequence[TableSlot], source: TriggerSource) -> None:
         """Load the whole table; see `scanner.devices.TriggerBoard.program`."""
         self._check_idle()
         self._table = board_table(table, source, CAPABILITIES, self._name)
         self._source = source
 
+    @_one_at_a_time
     def arm(self) -> None:
         """Wait for the source; see `scanner.devices.TriggerBoard.arm`."""
         self._check_idle()
@@ -84,8 +103,9 @@ class SimulatedTriggerBoard:
         self._runs += 1
         self._reckoned = self._told = 0
         self._last_told_ns = now
-        self._edges, self._stamps = [edge for edge in self._edges if edge <= now], []
+        self._edges, self._stamps = [edge for edge in self._edges[-REMEMBERED:] if edge <= now], []
 
+    @_one_at_a_time
     def fire(self) -> None:
         """Start the table now; see `scanner.devices.TriggerBoard.fire`."""
         self._check_plugged()
@@ -96,11 +116,13 @@ class SimulatedTriggerBoard:
         self._run.fire(self._clock.now_ns())
         self._put_on_line()
 
+    @_one_at_a_time
     def abort(self) -> None:
         """Stop, outputs low; see `scanner.devices.TriggerBoard.abort`."""
         self._check_plugged()
         self._stop()
 
+    @_one_at_a_time
     def events(self) -> Sequence[TriggerEvent]:
         """Pulses given since `arm`; see `scanner.devices.TriggerBoard.events`."""
         self._check_plugged()
@@ -108,6 +130,7 @@ class SimulatedTriggerBoard:
         lost = self._faults.lose_events
         return [event for event in self._stamps if event.t_ns + event.bound_ns <= now and event.step not in lost]
 
+    @_one_at_a_time
     def faults(self) -> Sequence[TriggerFault]:
         """What went wrong since `arm`; see `scanner.devices.TriggerBoard.faults`."""
         self._check_plugged()
@@ -128,6 +151,7 @@ class SimulatedTriggerBoard:
                 found.append(TriggerFault("overrun", text, step, run.fault.t_ns))
         return found
 
+    @_one_at_a_time
     def close(self) -> None:
         """Abort and give the device back; may be called twice."""
         if self._open:
@@ -137,6 +161,7 @@ class SimulatedTriggerBoard:
 
     # --- the line ------------------------------------------------------------------------------------------------
 
+    @_one_at_a_time
     def next_edge(self, after_ns: int) -> int | None:
         """The camera output's next rising edge; see `drivers.simulated.lines.Line`."""
         while True:

@@ -22,3 +22,8 @@ def test_a_file_in_its_place_is_left_alone(tmp_path: Path) -> None:
 def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no folder"):
         LightReceiver(cast("Any", None), tmp_path / "nowhere" / "light")
+
+
+def test_a_name_that_is_too_long_for_a_socket_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="too long"):
+        LightReceiver(cast("Any", None), tmp_path / ("light" * 40))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numpy as np
 import pytest
 
 from drivers.simulated import trigger_driver
+from drivers.simulated.gige_time import Edges
 from drivers.simulated.table_run import Step, TableRun
 from drivers.simulated.trigger_board import SimulatedTriggerBoard
 from scanner.devices import TableSlot, TriggerMode, TriggerSource
@@ -129,6 +131,36 @@ def test_a_slot_without_a_trigger_gives_no_pulse_and_no_event() -> None:
 
 
 # --- states ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_look_at_the_line_from_another_thread_takes_no_edge_from_a_new_run() -> None:
+    """As the relay of light to a camera in another process looks."""
+    bench = TriggeredBench()
+    bench.greys(0)
+    flip = bench.projector.show(0)
+    bench.armed(slots(3))
+    looking, go_on, lines = threading.Event(), threading.Event(), bench.board._world.lines
+    vsync = lines["vsync"]
+
+    class Slow:
+        def next_edge(self, after_ns: int) -> int | None:
+            if not looking.is_set():
+                looking.set()
+                go_on.wait(5)
+            return vsync.next_edge(after_ns)
+
+    lines["vsync"] = Slow()
+    look = threading.Thread(target=bench.board.next_edge, args=(flip.t_ns,))
+    look.start()
+    assert looking.wait(5)
+    anew = threading.Thread(target=lambda: (bench.board.abort(), bench.board.arm()))
+    anew.start()
+    anew.join(0.05)
+    go_on.set()
+    look.join()
+    anew.join()
+    bench.wait(2)
+    assert bench.board.events()[0].t_ns < flip.t_ns + 2 * REFRESH_NS
 
 
 def test_abort_stops_the_pulses_and_keeps_the_table() -> None:
@@ -374,3 +406,15 @@ def test_a_stop_takes_back_what_was_reckoned_ahead() -> None:
     assert run.pulses[0].fall_ns == 112
     run.stop(105)
     assert run.pulses == []
+
+
+def test_a_counter_that_has_forgotten_edges_still_counts_them() -> None:
+    seen = Edges()
+    for t in range(10):
+        seen.add(t)
+    seen.reset(4)
+    assert [seen.count(t) for t in (3, 4, 9)] == [0, 1, 6]
+    for t in range(10, 10_000):
+        seen.add(t)
+    assert [seen.count(t) for t in (9_000, 9_999)] == [8_997, 9_996]
+    assert len(seen._times) < 3_000
