@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 
 from scanner.capture import FrameRecord
 from scanner.clock import Clock
-from scanner.devices import CameraFrame, CameraSettings, Flip, Pixels, TriggerMode
+from scanner.devices import CameraFrame, Flip, Pixels, TriggerMode
 from scanner.errors import DeviceLost
 from scanner.patterns import PatternSequence
 from scanner.sequencer.plan import Mode, Plan
 from scanner.sequencer.rig import Rig
+from scanner.sequencer.steady import Steady
 from scanner.sequencer.verify import judge
 
 PATIENCE = 3
@@ -55,18 +56,16 @@ def endless(
         DeviceLost: a device went away, or the camera gives no frames any more.
         DeviceError: a device refuses something.
     """
-    camera, settings = rig.camera, rig.settings
+    camera = rig.camera
     if load:
         rig.projector.load([rig.oriented(sequence.image(0))])
-    camera.apply(CameraSettings(plan.exposure_ns, settings.gain_db, settings.pixel_format, settings.region))
+    camera.apply(replace(rig.settings, exposure_ns=plan.exposure_ns))
     flip = rig.projector.show(0)
     # One exposure of the new light alone before the first: what a camera has begun, or keeps ready, shows nothing else.
     clock.sleep_until(flip.t_ns + flip.bound_ns + plan.trigger_delay_ns + plan.exposure_ns)
     triggered = plan.mode is Mode.SOFTWARE
     camera.start(TriggerMode.SOFTWARE if triggered else TriggerMode.FREE)
-    ready = flip.t_ns + flip.bound_ns + plan.window_start_ns
-    expected: int | None = None
-    absent = 0
+    steady, absent, lost = Steady(plan, flip), 0, 0
     try:
         while not cancelled():
             if triggered:
@@ -82,15 +81,14 @@ def endless(
                     )
                 continue
             absent = 0
-            if frame.exposure.start_ns - frame.exposure.bound_ns < ready:
+            if (before := steady.lost_before(frame)) is None:
                 continue
-            if expected is None:
-                expected = frame.frame_id
+            lost += before
             if not frame.complete:
-                continue  # half a frame is a lost one: the next whole one counts it
-            lost = max(0, frame.frame_id - expected)
-            expected = frame.frame_id + 1
+                lost += 1  # half a frame is a lost one
+                continue
             yield EndlessFrame(frame.pixels, _record(plan, flip, frame), lost)
+            lost = 0
     finally:
         camera.stop()
 

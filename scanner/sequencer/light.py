@@ -97,7 +97,7 @@ def measure_light(
 
 
 def fitting_exposure(shots: Shots, refresh: int) -> int:
-    """Whole refreshes at which white does not clip, or a part of one where a whole one does."""
+    """A refresh, or the longest of its halves, quarters ... at which white does not clip."""
     caps = shots.camera.capabilities
     exposure = refresh
     for _ in range(8):

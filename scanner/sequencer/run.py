@@ -7,19 +7,20 @@ nothing about content itself; `verify` judges the stamps and `witness` the pictu
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from scanner.capture import FrameRecord, Verdict
 from scanner.clock import Clock
-from scanner.devices import Camera, CameraFrame, CameraSettings, Flip, Pixels, Projector, TriggerMode
+from scanner.devices import Camera, CameraFrame, Flip, Pixels, Projector, TriggerMode
 from scanner.errors import DeviceLost, ScannerError, SyncError
 from scanner.patterns import PatternSequence
 from scanner.sequencer.disorder import set_of, sync_error
 from scanner.sequencer.findings import Witnesses
 from scanner.sequencer.plan import Mode, Plan
 from scanner.sequencer.rig import Rig
+from scanner.sequencer.steady import Steady
 from scanner.sequencer.thumbnail import thumbnail
 from scanner.sequencer.triggered import TriggeredRounds
 from scanner.sequencer.verify import FrameVerdict, judge, summary, verify
@@ -125,7 +126,7 @@ def acquire(
     *,
     on_frame: OnFrame | None = None,
     cancelled: Callable[[], bool] | None = None,
-    on_overrun: str = "count",
+    on_overrun: Literal["count", "stop"] = "count",
     load: bool = True,
 ) -> Acquisition:
     """Run `plan` and return how it ended; what was whole is recorded in every case.
@@ -205,10 +206,7 @@ class _Run:
         self.max_value = rig.camera.capabilities.max_value
 
     def prepare(self) -> None:
-        settings = self.settings
-        self.camera.apply(
-            CameraSettings(self.plan.exposure_ns, settings.gain_db, settings.pixel_format, settings.region)
-        )
+        self.camera.apply(replace(self.settings, exposure_ns=self.plan.exposure_ns))
         self.max_value = self.camera.capabilities.max_value
 
     def finished(self, reason: FinishReason, error: ScannerError | None) -> Acquisition:
@@ -231,9 +229,7 @@ class _Run:
         flip = self.projector.show(0)
         self.clock.sleep_until(flip.t_ns + self.plan.trigger_delay_ns)
         self.camera.start(TriggerMode.FREE)
-        ready = flip.t_ns + flip.bound_ns + self.plan.window_start_ns
-        expected: int | None = None
-        taken = 0
+        steady, taken = Steady(self.plan, flip), 0
         while taken < self.plan.repeat:
             self.go_on()
             frame = self.camera.pop(self.plan.pop_timeout_ns)
@@ -241,11 +237,10 @@ class _Run:
                 self.missing(taken, flip)
                 taken += 1
                 continue
-            if frame.exposure.start_ns - frame.exposure.bound_ns < ready:
+            if (lost := steady.lost_before(frame)) is None:
                 continue
-            if expected is not None and frame.frame_id > expected:
-                self.lost(frame.frame_id - expected)
-            expected = frame.frame_id + 1
+            if lost:
+                self.lost(lost)
             self.take(taken, flip, frame)
             taken += 1
 
@@ -353,7 +348,7 @@ class _Run:
 
     def put(self, record: FrameRecord, offset: int | None) -> None:
         verdict: Verdict = "unproved" if record.slot is None else judge(self.plan, record, None).verdict
-        record = FrameRecord(**{**record.__dict__, "verdict": verdict})
+        record = replace(record, verdict=verdict)
         self.records.append(record)
         self.sink.record(record)
         if self.on_frame is not None:
@@ -368,14 +363,12 @@ class _Run:
         whole: set[int] = set()
         for repetition in range(self.plan.repeat):
             first = repetition * self.plan.patterns
+            # Frames already known to be wrong would only confuse the content of the others.
             shown = {
                 pattern - first: pixels
                 for pattern, pixels in self.thumbnails.items()
-                if first <= pattern < first + self.plan.patterns
+                if first <= pattern < first + self.plan.patterns and pattern not in found
             }
-            if any(position + first in found for position in range(self.plan.patterns)) and len(found) > 0:
-                # Frames already known to be wrong would only confuse the content of the others.
-                shown = {position: pixels for position, pixels in shown.items() if position + first not in found}
             seen = witness(self.sequence, shown, self.max_value)
             self.witnesses = seen if repetition == 0 else self.witnesses.joined(seen)
             found.update(first + position for position in seen.suspects)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 
 import numpy as np
@@ -93,8 +93,7 @@ class Shots:
     def expose_for(self, exposure_ns: int) -> int:
         """Stop, set the exposure, start again. Returns what the camera took."""
         self.camera.stop()
-        s = self.settings
-        taken = self.camera.apply(CameraSettings(exposure_ns, s.gain_db, s.pixel_format, s.region))
+        taken = self.camera.apply(replace(self.settings, exposure_ns=exposure_ns))
         self.exposure_ns = exposure_ns if taken.exposure_ns is None else taken.exposure_ns
         self.camera.start(self.mode)
         return self.exposure_ns
