@@ -27,7 +27,7 @@ from scanner.devices import Pixels, Truth
 from scanner.errors import CalibrationError, DecodeError
 from scanner.filters import FilterSettings
 from scanner.geometry import Calibration, load_calibration
-from scanner.patterns import McpPattern, PatternSequence, PmpPattern
+from scanner.patterns import GrayPmpPattern, McpPattern, PatternSequence, PmpPattern
 from scanner.ripple_correction import without_ripple
 from scanner.scale_check import require_codes_within, require_geometry
 from scanner.scan import Scan, build_scan
@@ -147,7 +147,7 @@ class Reconstruction:
         decoded = self._carriers_fit(self._fits_geometry(decoded), capture)
         tell("triangulating")
         scan = build_scan(decoded, self._calibration, self._options.filters, timings=self._timings)
-        if isinstance(self._header.sequence.pattern, PmpPattern):
+        if isinstance(self._header.sequence.pattern, PmpPattern | GrayPmpPattern):
             with self._timed("widen sigmas"):
                 scan = widen_at_edges(scan, "y" if self._calibration is None else self._calibration.phase_axis)
         scan = scan.with_report(
@@ -337,6 +337,7 @@ def raise_if_empty(decoded: Decoded) -> None:
 def ambiguity_px(sequence: PatternSequence) -> float | None:
     """Projector px by which a value is off if its fringe order or stripe is wrong; None where codes have no period."""
     pattern, projector = sequence.pattern, sequence.projector
+    pattern = pattern.pmp if isinstance(pattern, GrayPmpPattern) else pattern
     if isinstance(pattern, PmpPattern):
         return min(projector.along(axis) for axis in pattern.axes) / max(pattern.frequencies)
     return pattern.pitch_px(projector) if isinstance(pattern, McpPattern) else None

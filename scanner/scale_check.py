@@ -19,7 +19,7 @@ from scanner.decode import Decoded, Reason
 from scanner.errors import DecodeError
 from scanner.geometry import Array, Calibration
 from scanner.orientation import require_orientation
-from scanner.patterns import GrayPattern, PatternSequence, PmpPattern
+from scanner.patterns import GrayPattern, GrayPmpPattern, PatternSequence, PmpPattern
 from scanner.patterns.description import Axis
 
 STEPS = (8, 16, 32, 64)
@@ -117,7 +117,7 @@ def require_codes_within(decoded: Decoded, sequence: PatternSequence) -> None:
     Raises:
         DecodeError: a tenth of those that could be read do not.
     """
-    pattern = sequence.pattern
+    pattern = sequence.pattern.gray if isinstance(sequence.pattern, GrayPmpPattern) else sequence.pattern
     if not isinstance(pattern, GrayPattern):
         return
     beyond = int(np.count_nonzero(decoded.reason == Reason.BORDER))
@@ -174,6 +174,8 @@ def _members(sequence: PatternSequence) -> str:
     pattern = sequence.pattern
     if isinstance(pattern, GrayPattern):
         return f"code_bits ({pattern.code_bits}; bits is {pattern.bits})"
+    if isinstance(pattern, GrayPmpPattern):
+        return f"frequencies ({pattern.pmp.frequencies[0]:g}) and code_bits ({pattern.gray.code_bits})"
     if isinstance(pattern, PmpPattern):
         return f"frequencies ({', '.join(f'{f:g}' for f in pattern.frequencies)})"
     return "bits"

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scanner.calibration_spread import depth_spread
 from scanner.decode.pmp_frames import design_matrix
 from scanner.geometry import Calibration
-from scanner.patterns import Axis, PatternSequence, PmpPattern
+from scanner.patterns import Axis, GrayPmpPattern, PatternSequence, PmpPattern
 from scanner.scan import Scan
 
 COVERAGE_FACTOR = 2.0
@@ -100,7 +100,8 @@ def budget_of(
     per_px = float(np.median(mm[known] / px[known]))
     of_repeats = f", mean of {repeat} repetitions" if repeat > 1 else ""
     noise = Contribution("noise", "random", noise_px, noise_mm, f"median of the points' sigmas{of_repeats}")
-    light = [_response(scan, sequence, axis), _grey_levels(sequence, axis)] if _is_pmp(sequence) else []
+    fringes = _fringes(sequence)
+    light = [] if fringes is None else [_response(scan, axis), _grey_levels(sequence, axis)]
     causes = (noise, *light, _sync(sequence, mixed, axis))
     contributions = [_in_mm(cause, per_px) for cause in causes]
     contributions.insert(1, _calibration(scan, calibration, axis))
@@ -111,8 +112,10 @@ def _like(values: Any, some: Any) -> Any:
     return values if values.shape == some.shape[:2] else values[::4, ::4]
 
 
-def _is_pmp(sequence: PatternSequence) -> bool:
-    return isinstance(sequence.pattern, PmpPattern)
+def _fringes(sequence: PatternSequence) -> PmpPattern | None:
+    """What coordinates are measured by, where that is fringes."""
+    pattern = sequence.pattern.pmp if isinstance(sequence.pattern, GrayPmpPattern) else sequence.pattern
+    return pattern if isinstance(pattern, PmpPattern) else None
 
 
 def _in_mm(cause: Contribution, per_px: float) -> Contribution:
@@ -130,7 +133,7 @@ def _calibration(scan: Scan, calibration: Calibration, axis: Axis) -> Contributi
     return Contribution("calibration", "systematic", None, spread, f"covariance of the calibration{unverified}")
 
 
-def _response(scan: Scan, sequence: PatternSequence, axis: Axis) -> Contribution:
+def _response(scan: Scan, axis: Axis) -> Contribution:
     """What the frequencies of the scan contradict one another by, beyond noise."""
     decoder = scan.report.get("decoder") or {}
     ripple = ((decoder.get("unwrapping") or {}).get(axis) or {}).get("ripple")
@@ -154,8 +157,8 @@ def _grey_levels(sequence: PatternSequence, axis: Axis) -> Contribution:
 
 def grey_level_px(sequence: PatternSequence, axis: Axis) -> float:
     """Rms error of the coordinate that a perfect camera would read of the finest set's images, projector px."""
-    pattern = sequence.pattern
-    if not isinstance(pattern, PmpPattern):
+    pattern = _fringes(sequence)
+    if pattern is None:
         raise TypeError("grey levels of fringes")
     finest = max((s for s in pattern.sets() if s.axis == axis), key=lambda s: s.frequency)
     along = sequence.projector.along(axis)
@@ -189,8 +192,8 @@ def _sync(sequence: PatternSequence, mixed: float | None, axis: Axis) -> Contrib
         return Contribution("sync", "systematic", None, None, "no time stamps: the frames' content alone was judged")
     if mixed == 0:
         return Contribution("sync", "systematic", 0.0, 0.0, "every frame proved to have seen its pattern alone")
-    pattern = sequence.pattern
-    if not isinstance(pattern, PmpPattern) or mixed >= 1:
+    pattern = _fringes(sequence)
+    if pattern is None or mixed >= 1:
         says = f"up to {mixed:.1%} of an exposure may have seen the next pattern, as far as stamps tell"
         return Contribution("sync", "systematic", None, None, says)
     # The next shift's light, in every frame alike, turns all phases by its share of a shift; anywhere up to that.

@@ -29,13 +29,15 @@ from scanner.patterns import (
     ProjectorSize,
     pattern_from_description,
 )
+from scanner.patterns.description import read_numbers
+from scanner.patterns.graypmp import default_gray_pmp
 from scanner.patterns.sequence import Precorrection
 from scanner.sequencer import Rig, measure_latency
 from scanner.wire import ScanStart
 
 _log = logging.getLogger(__name__)
 
-METHODS = ("pmp", "mcp", "gray", "cp")
+METHODS = ("pmp", "mcp", "gray", "cp", "gray+pmp")
 
 PMP_FINEST = 64
 """Cycles of the finest default fringe."""
@@ -223,6 +225,8 @@ def pattern_for(method: str, given: Mapping[str, Any], axis: Axis, projector: Pr
     if given.get("method", method) != method:
         raise ConfigError(f"the pattern is {given['method']!r}, the method {method!r}", hint="leave one of them out")
     default = default_pattern(method, tuple(given.get("axes") or (axis,)), given.get("axis", axis), projector)
+    if method == "gray+pmp" and "frequencies" in given:
+        default = default_gray_pmp(tuple(given.get("axes") or (axis,)), projector, read_numbers(given, "frequencies")[0])
     _refuse_unknown(method, given, default)
     described = {**default.describe(), **given}
     if method == "pmp" and "frequencies" in given and "shifts" not in given:
@@ -249,6 +253,8 @@ def default_pattern(method: str, axes: tuple[Axis, ...], axis: Axis, projector: 
     """A method's default pattern on this projector."""
     if method == "pmp":
         return PmpPattern(axes=axes, frequencies=_pmp_frequencies(axes, projector), shifts=(8, 8, 8))
+    if method == "gray+pmp":
+        return default_gray_pmp(axes, projector)
     if method == "gray":
         bits = max(math.ceil(math.log2(projector.along(a))) for a in axes)
         return GrayPattern(axes=axes, bits=bits, code_bits=bits)

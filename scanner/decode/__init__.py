@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from scanner.decode.stages import Observer
 from scanner.errors import DecodeError
-from scanner.patterns import CameraFormat, CompositePattern, McpPattern, PatternSequence, PmpPattern
+from scanner.patterns import (
+    CameraFormat,
+    CompositePattern,
+    GrayPmpPattern,
+    McpPattern,
+    PatternSequence,
+    PmpPattern,
+)
 
 Map = NDArray[np.float32]
 """(H, W) float32, NaN where undecided"""
@@ -154,6 +161,10 @@ def decoder_for(
         from scanner.decode.composite import CompositeDecoder  # noqa: PLC0415
 
         return CompositeDecoder(sequence, camera)
+    if isinstance(sequence.pattern, GrayPmpPattern):
+        from scanner.decode.graypmp import GrayPmpDecoder  # noqa: PLC0415
+
+        return GrayPmpDecoder(sequence, camera)
     from scanner.decode.graycode import GrayDecoder  # noqa: PLC0415
 
     return GrayDecoder(sequence, camera)

@@ -147,17 +147,19 @@ def decode_axis(
     maps: AxisMaps,
     thresholds: PmpThresholds,
     threads: int,
+    ladder: Ladder | None = None,
 ) -> AxisFound:
     """Decode one axis into `maps`.
 
     Args:
-        along: projector pixels along the axis. threads: that share the pass.
+        along: projector pixels along the axis. threads: that share the pass. ladder: the way up to the finest set;
+            None: as `plan_ladder` finds it.
     """
     t = thresholds
     pixels, finest = camera.width * camera.height, finest_of(pattern)
     # The field's centre as a fraction of it, where the pattern's phase is counted from `origin` before pixel 0.
     centre = 0.5 + (pattern.origin - 0.5) / along
-    ladder = plan_ladder(pattern.frequencies, frames.gains)
+    ladder = ladder or plan_ladder(pattern.frequencies, frames.gains)
     sample = take_sample(frames, pixels, camera.max_value, t.clip(camera), t.min_modulation_levels)
     least = max(t.min_modulation_levels, t.min_modulation_share * sample.brightest(finest))
     sample, light = judge_light(sample, frames, pattern.frequencies, along, least, t.min_modulation_sigmas)

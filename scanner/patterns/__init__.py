@@ -9,10 +9,11 @@ from scanner.patterns.description import (
     ProjectorSize,
 )
 from scanner.patterns.graycode import GrayPattern
+from scanner.patterns.graypmp import GrayPmpPattern
 from scanner.patterns.mcp import McpPattern
 from scanner.patterns.methods import pattern_from_description
 from scanner.patterns.pmp import PmpPattern
-from scanner.patterns.sequence import PatternSequence
+from scanner.patterns.sequence import PartSequence, PatternSequence
 
 __all__ = [
     "Axis",
@@ -20,7 +21,9 @@ __all__ = [
     "CompositePattern",
     "FrameRole",
     "GrayPattern",
+    "GrayPmpPattern",
     "McpPattern",
+    "PartSequence",
     "Pattern",
     "PatternSequence",
     "PmpPattern",

@@ -9,13 +9,17 @@ from scanner.errors import DecodeError
 from scanner.patterns.composite import CompositePattern
 from scanner.patterns.description import Pattern
 from scanner.patterns.graycode import GrayPattern
+from scanner.patterns.graypmp import GrayPmpPattern
 from scanner.patterns.mcp import McpPattern
 from scanner.patterns.pmp import PmpPattern
 
-_METHODS: Mapping[str, type[PmpPattern] | type[McpPattern] | type[GrayPattern] | type[CompositePattern]] = {
+_Patterns = type[PmpPattern] | type[McpPattern] | type[GrayPattern] | type[CompositePattern] | type[GrayPmpPattern]
+
+_METHODS: Mapping[str, _Patterns] = {
     "pmp": PmpPattern,
     "mcp": McpPattern,
     "gray": GrayPattern,
+    "gray+pmp": GrayPmpPattern,
     "cp": CompositePattern,
 }
 

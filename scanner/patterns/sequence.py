@@ -108,7 +108,7 @@ class PatternSequence:
         axes: tuple[Axis, ...] = getattr(pattern, "axes", ())
         full, dark = (before, before + 1) if pattern.method == "gray" or white else (None, None)
         first = before + (2 if full is not None else 0) + pattern.fringe_count
-        bars = {axis: first + i for i, axis in enumerate(axes)} if pattern.method in ("pmp", "gray") else {}
+        bars = {axis: first + i for i, axis in enumerate(axes)} if pattern.method in ("pmp", "gray", "gray+pmp") else {}
         end = first + len(bars)
         sentinels = (*range(before), *range(end, end + after))
         return cls(projector, pattern, full, dark, sentinels, bars, precorrection)
@@ -206,6 +206,33 @@ class PatternSequence:
         if self.bars:
             described["bars"] = dict(self.bars)
         return described
+
+
+@dataclass(frozen=True)
+class PartSequence(PatternSequence):
+    """One method's images among those of a sequence that has two, at the positions they have there."""
+
+    chosen: tuple[int, ...] = ()
+    """positions of this method's images, in the pattern's order"""
+    total: int = 0
+    """positions in all"""
+
+    def __len__(self) -> int:
+        return self.total
+
+    @property
+    def fringes(self) -> tuple[int, ...]:
+        """Positions of this method's images alone."""
+        return self.chosen
+
+    @classmethod
+    def of(cls, whole: PatternSequence, pattern: Pattern, first: int) -> PartSequence:
+        """The part of `whole` whose images are `pattern`'s and begin at its fringe `first`."""
+        chosen = whole.fringes[first : first + pattern.fringe_count]
+        return cls(
+            whole.projector, pattern, whole.white, whole.black, whole.sentinels, whole.bars, whole.precorrection,
+            chosen, len(whole),
+        )  # fmt: skip
 
 
 def bar_light(position: NDArray[Any], size: int) -> NDArray[np.float32]:

@@ -7,9 +7,10 @@ full-on and full-off frames in `witness_levels`, of fringe sets in `witness_frin
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from scanner.devices import Pixels
-from scanner.patterns import PatternSequence
+from scanner.patterns import GrayPmpPattern, PartSequence, PatternSequence
 from scanner.sequencer.findings import Witness, Witnesses, look
 from scanner.sequencer.witness_fringes import fringe_witnesses
 from scanner.sequencer.witness_gray import gray_witnesses
@@ -39,4 +40,9 @@ def witness(sequence: PatternSequence, thumbnails: Mapping[int, Pixels], max_val
         items += fringe_witnesses(scene, cannot)
     elif sequence.pattern.method == "gray":
         items += gray_witnesses(scene, cannot)
+    elif isinstance(pattern := sequence.pattern, GrayPmpPattern):
+        fringes = PartSequence.of(sequence, pattern.pmp, 0)
+        items += fringe_witnesses(replace(scene, sequence=fringes), cannot)
+        code = PartSequence.of(sequence, pattern.gray, pattern.pmp.fringe_count)
+        items += gray_witnesses(replace(scene, sequence=code), cannot)
     return Witnesses(tuple(items), tuple(cannot))

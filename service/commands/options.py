@@ -39,6 +39,7 @@ class Method(StrEnum):
     MCP = "mcp"
     GRAY = "gray"
     CP = "cp"
+    GRAY_PMP = "gray+pmp"
 
 
 # --- patterns -----------------------------------------------------------------------------------------------------
@@ -58,7 +59,7 @@ AxisOption = Annotated[
     typer.Option(metavar="x|y|xy", help="Phase direction: y measures projector rows, x columns. Default: the rig's."),
 ]
 Bits = Annotated[
-    int | None, typer.Option(metavar="N", min=1, max=16, help="MCP: bits of a code word; gray: bits shown.")
+    int | None, typer.Option(metavar="N", min=1, max=16, help="MCP: bits of a code word; gray, gray+pmp: bits shown.")
 ]
 Carriers = Annotated[
     str | None,
@@ -96,6 +97,7 @@ class PatternOptions:
             Method.MCP: {"axis", "bits", "carriers", "profile", "levels", "white"},
             Method.GRAY: {"axis", "bits"},
             Method.CP: {"axis", "carriers"},
+            Method.GRAY_PMP: {"frequencies", "shifts", "axis", "bits"},
         }[method]
         given = {name: value for name, value in vars(self).items() if value is not None}
         for name in given.keys() - allowed:
@@ -125,6 +127,10 @@ def _followed(members: dict[str, Any], method: Method) -> dict[str, Any]:
     Raises:
         typer.BadParameter: they contradict each other.
     """
+    if method == Method.GRAY_PMP and len(members.get("frequencies", [0])) != 1:
+        raise typer.BadParameter("--frequencies: gray+pmp takes one, and tells fringes apart by the code")
+    if method == Method.GRAY_PMP and len(members.get("shifts", [0])) != 1:
+        raise typer.BadParameter("--shifts: gray+pmp takes one number")
     if method == Method.PMP and "shifts" in members:
         count = len(members.get("frequencies", DEFAULT_FREQUENCIES * [0]))
         shifts = members["shifts"]

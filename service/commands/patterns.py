@@ -31,7 +31,7 @@ DEFAULT_SIZE = "1152x864"
 
 
 def patterns(
-    method: Annotated[Method, typer.Argument(metavar="METHOD", help="pmp, mcp, gray or cp.")],
+    method: Annotated[Method, typer.Argument(metavar="METHOD", help="pmp, mcp, gray, gray+pmp or cp.")],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", parser=output_path, help="Folder to write to.")
     ],

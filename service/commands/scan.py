@@ -53,7 +53,7 @@ def scan(
         str | None,
         typer.Option(metavar="RIG", help="A rig file, or simulated[:SCENE], as simulated:bench2026/sphere_board."),
     ] = None,
-    method: Annotated[Method, typer.Option(metavar="pmp|mcp|gray|cp", help="What to project.")] = Method.PMP,
+    method: Annotated[Method, typer.Option(metavar="pmp|mcp|gray|gray+pmp|cp", help="What to project.")] = Method.PMP,
     output: OutputFolder = None,
     connect: Connect = None,
     exposure: Annotated[

@@ -1,0 +1,206 @@
+"""Decoding Gray + PMP: one fringe set's phase, and the fringe nearest to where the Gray code puts a pixel.
+
+Both parts go through the decoders of their own methods; here they are put together. A cell of the code is half a
+fringe or less, so that the phase's place and the code's differ by a quarter of a fringe in the middle of a cell, and by
+no more than half of one where a border bit is read as its neighbour's. Pixels where they differ by more are undecided.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode import Decoded, Map, Reason
+from scanner.decode.frames import FrameCheck
+from scanner.decode.graycode import GrayDecoder
+from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis
+from scanner.decode.pmp_frames import axis_frames
+from scanner.decode.reasons import REASONS
+from scanner.decode.strips import threads_to_use
+from scanner.decode.unwrapping import Ladder
+from scanner.errors import DecodeError
+from scanner.kernel import kernel
+from scanner.patterns import CameraFormat, GrayPmpPattern, PartSequence, PatternSequence
+from scanner.patterns.description import Axis
+
+MOST_APART = 0.42
+"""Of a fringe, between the places of phase and code: beyond, the next fringe is nearly as likely. In the middle of cells
+of half a fringe it is a quarter at most."""
+
+
+class GrayPmpDecoder:
+    """A `scanner.decode.Decoder` for one Gray + PMP capture.
+
+    Args:
+        sequence: what was projected; its pattern is a `GrayPmpPattern`.
+        camera: the frames' format.
+        threads: that share the pass over the pixels; as `threads_to_use` says if None.
+    """
+
+    def __init__(self, sequence: PatternSequence, camera: CameraFormat, threads: int | None = None) -> None:
+        if not isinstance(sequence.pattern, GrayPmpPattern):
+            raise DecodeError(f"a Gray + PMP decoder cannot decode method {sequence.pattern.method!r}")
+        self._sequence, self._pattern, self._camera = sequence, sequence.pattern, camera
+        self._threads = threads or threads_to_use()
+        self._check = FrameCheck(sequence, camera)
+        self._frames: dict[int, NDArray[Any]] = {}
+
+    def add(self, position: int, frame: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+        """Take a copy of the frame at `position`.
+
+        Raises:
+            DecodeError: wrong size or dtype, or a position that was given before or does not exist.
+        """
+        self._check.take(position, frame)
+        self._frames[position] = frame.copy(order="C")
+
+    def finish(self) -> Decoded:
+        """The maps.
+
+        Raises:
+            DecodeError: frames without which phase or code cannot be read are missing; they are named.
+        """
+        self._require_fringes()
+        found = {axis: self._phases(axis) for axis in self._pattern.axes}
+        code = self._code(next(iter(found.values())).maps)
+        warnings = list(code.warnings)
+        counts = np.zeros(REASONS, np.int64)
+        for axis, of_axis in found.items():
+            cells = code.rows if axis == "y" else code.columns
+            if cells is None:
+                raise AssertionError("the code has the axes of the fringes")
+            along = self._sequence.projector.along(axis)
+            period = along / self._pattern.pmp.frequencies[0]
+            m = of_axis.maps
+            _choose_fringe(
+                m.position, m.sigma, m.confidence, m.reason, cells.reshape(-1), code.confidence.reshape(-1),
+                code.reason.reshape(-1), np.float32(period), np.float32(along), np.float32(MOST_APART),
+            )  # fmt: skip
+            if (changes := of_axis.light.flicker) is not None:
+                warnings += filter(None, [changes.warning(axis, of_axis.random_px)])
+        first, *other = [f.maps for f in found.values()]
+        if other:
+            first.join(other[0])
+        counts = np.bincount(first.reason, minlength=REASONS)
+        return self._decoded(found, first, code, counts, tuple(warnings))
+
+    def _require_fringes(self) -> None:
+        lost, first = [], 0
+        for s in self._pattern.pmp.sets():
+            positions = self._sequence.fringes[s.first : s.first + s.shifts]
+            missing = [p for p in positions if p not in self._frames]
+            if s.shifts - len(missing) < 3:
+                lost += missing
+            first += s.shifts
+        if lost:
+            raise DecodeError(
+                f"frames {', '.join(map(str, lost))} are missing: a fringe set needs three",
+                hint="capture these frames again",
+            )
+
+    def _phases(self, axis: Axis) -> AxisFound:
+        """The axis's coordinates as if all pixels saw the fringe at the field's centre."""
+        pmp = self._pattern.pmp
+        by_fringe = {n: self._frames[p] for n, p in enumerate(self._sequence.fringes) if p in self._frames}
+        frames = axis_frames(pmp, axis, by_fringe)
+        alone = Ladder(np.eye(1, dtype=np.int64), np.array(pmp.frequencies), np.zeros((0, 1)), periodic=False)
+        maps = AxisMaps.empty(self._camera.width * self._camera.height)
+        along = self._sequence.projector.along(axis)
+        return decode_axis(pmp, along, self._camera, frames, maps, PmpThresholds(), self._threads, alone)
+
+    def _code(self, light: AxisMaps) -> Decoded:
+        """The code, decoded. Where neither inverses nor white and black were projected, the fringes stand for them."""
+        part = PartSequence.of(self._sequence, self._pattern.gray, self._pattern.pmp.fringe_count)
+        frames = {p: self._frames[p] for p in part.chosen if p in self._frames}
+        for position in (part.white, part.black):
+            if position is not None and position in self._frames:
+                frames[position] = self._frames[position]
+        if not self._pattern.gray.inverse and (part.white is None or part.black is None):
+            part = PartSequence(
+                part.projector, part.pattern, part.total, part.total + 1, part.sentinels, part.bars,
+                part.precorrection, part.chosen, part.total + 2,
+            )  # fmt: skip
+            for position, sign in ((part.total - 2, 1), (part.total - 1, -1)):
+                level = np.clip(light.albedo + sign * light.modulation, 0, self._camera.max_value)
+                frames[position] = np.rint(level).astype(self._camera.dtype).reshape(self._camera.shape)
+        decoder = GrayDecoder(part, self._camera, threads=self._threads)
+        for position, frame in frames.items():
+            decoder.keep(position, frame)
+        return decoder.finish()
+
+    def _decoded(
+        self,
+        found: dict[Axis, AxisFound],
+        maps: AxisMaps,
+        code: Decoded,
+        counts: NDArray[np.int64],
+        warnings: tuple[str, ...],
+    ) -> Decoded:
+        shape = self._camera.shape
+        values: dict[Axis, tuple[Map, Map]] = {
+            axis: (f.maps.position.reshape(shape), f.maps.sigma.reshape(shape)) for axis, f in found.items()
+        }
+        rows, sigma_rows = values.get("y", (None, None))
+        columns, sigma_columns = values.get("x", (None, None))
+        return Decoded(
+            rows=rows,
+            columns=columns,
+            sigma_rows=sigma_rows,
+            sigma_columns=sigma_columns,
+            confidence=maps.confidence.reshape(shape),
+            albedo=maps.albedo.reshape(shape),
+            modulation=maps.modulation.reshape(shape),
+            reason=maps.reason.reshape(shape),
+            warnings=warnings,
+            details={
+                "method": self._pattern.method,
+                "counts": {r.name.lower(): int(counts[r]) for r in Reason if counts[r]},
+                "noise": asdict(next(iter(found.values())).noise),
+                "light": {axis: f.light.as_dict() for axis, f in found.items()},
+                "code": {key: code.details[key] for key in ("counts", "thresholds", "noise_factor")},
+            },
+        )
+
+
+@kernel
+def _choose_fringe(
+    position: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    reason: NDArray[np.uint8],
+    cells: NDArray[np.float32],
+    code_confidence: NDArray[np.float32],
+    code_reason: NDArray[np.uint8],
+    period: np.float32,
+    along: np.float32,
+    most_apart: np.float32,
+) -> None:
+    """Put each phase on the fringe nearest to its cell's centre. All (P,); the first four are changed."""
+    for i in range(reason.size):
+        why = reason[i] if reason[i] != 0 else code_reason[i]
+        if why == 0:
+            apart = cells[i] - position[i]
+            order = np.rint(apart / period)
+            value = position[i] + order * period
+            if abs(apart - order * period) > most_apart * period:
+                why = np.uint8(4)
+            elif value < -0.5 or value > along - np.float32(0.5):
+                why = np.uint8(5)
+            else:
+                position[i] = value
+                confidence[i] = min(confidence[i], code_confidence[i])
+        if why != 0:
+            position[i] = np.float32(np.nan)
+            sigma[i] = np.float32(np.nan)
+            confidence[i] = np.float32(0)
+        reason[i] = why
+
+
+def warm_up() -> None:
+    """Compile the kernel."""
+    one, why = np.zeros(2, np.float32), np.zeros(2, np.uint8)
+    scale = np.float32(1)
+    _choose_fringe(one.copy(), one.copy(), one.copy(), why.copy(), one, one, why, scale, scale, scale)
