@@ -9,7 +9,7 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -77,6 +77,29 @@ def prepare_output(folder: Path, *, force: bool = False) -> Path:
         if not os.access(folder, os.W_OK | os.X_OK):
             raise StorageError(f"{folder} is not writable", hint="give another -o DIR")
     return folder
+
+
+def try_output(folder: Path, *, force: bool = False) -> None:
+    """Look whether `prepare_output` will do, long before there is something to write. Leaves nothing.
+
+    Raises:
+        StorageError: as `prepare_output`.
+    """
+    with storage_errors(folder):
+        new = [path for path in (folder, *folder.parents) if not path.exists()]
+    prepare_output(folder, force=force)
+    remove_empty(new)
+
+
+def remove_empty(folders: Iterable[Path]) -> None:
+    """Remove folders that were made in vain, innermost first; one that somebody uses stays, and those around it."""
+    for folder in folders:
+        try:
+            folder.rmdir()
+        except FileNotFoundError:
+            continue
+        except OSError:
+            return
 
 
 def check_room(folder: Path, needed: int) -> None:

@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import datetime
 from itertools import chain, count
 from pathlib import Path
@@ -104,13 +105,51 @@ def scan(
         "compare_truth": compare_truth,
         "repeat": repeat,
     }
-    folder = output or _fresh_folder()
+    place = Place(output, force)
+    place.check()
     began = time.monotonic()
-    with _output(folder, force=force), progress_lines() as lines, rig_daemon(rig, connect, lines) as endpoint:
-        _scan(endpoint, method, params, folder, lines)
+    with progress_lines() as lines, rig_daemon(rig, connect, lines) as endpoint:
+        folder = _scan(endpoint, method, params, place, lines)
         lines.stage("ending")
     report_result(folder, time.monotonic() - began, lines.spent, as_json=as_json)
     return 0
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a scan's files go. Its folder is made when they arrive: a command that is killed before leaves none."""
+
+    wanted: Path | None
+    force: bool
+
+    @property
+    def folder(self) -> Path:
+        """The one that was asked for, or one that is free now."""
+        return self.wanted or _fresh_folder()
+
+    def check(self) -> None:
+        """Raise StorageError where no folder can be made, before anything moves."""
+        from scanner.storage import try_output  # noqa: PLC0415
+
+        try_output(self.folder, force=self.force)
+
+    @contextmanager
+    def made(self) -> Iterator[Path]:
+        """The folder; one that was made for files that do not arrive is removed again."""
+        from scanner.storage import prepare_output, remove_empty, storage_errors  # noqa: PLC0415
+
+        folder = self.folder
+        with storage_errors(folder):
+            new = [path for path in (folder, *folder.parents) if not path.exists()]
+        prepare_output(folder, force=self.force)
+        incoming = folder / INCOMING
+        shutil.rmtree(incoming, ignore_errors=True)  # of a command that was killed: its files are another scan's
+        try:
+            yield folder
+        except BaseException:
+            shutil.rmtree(incoming, ignore_errors=True)
+            remove_empty(new)
+            raise
 
 
 def _fresh_folder() -> Path:
@@ -138,25 +177,6 @@ def exposure_given(text: str) -> float | Literal["auto"]:
 
 
 @contextmanager
-def _output(folder: Path, *, force: bool) -> Iterator[None]:
-    """The output folder; one that was made for a scan that fails is removed again."""
-    from scanner.storage import prepare_output, storage_errors  # noqa: PLC0415
-
-    with storage_errors(folder):
-        new = [path for path in (folder, *folder.parents) if not path.exists()]
-    prepare_output(folder, force=force)
-    try:
-        yield
-    except BaseException:
-        shutil.rmtree(folder / INCOMING, ignore_errors=True)
-        for path in new:
-            if any(path.iterdir()):
-                break
-            path.rmdir()
-        raise
-
-
-@contextmanager
 def rig_daemon(rig: str | None, connect: str | None, lines: ProgressLines) -> Iterator[str]:
     """Endpoint of the daemon to ask: the one named, or a private one with this rig."""
     if connect is not None:
@@ -171,8 +191,8 @@ def rig_daemon(rig: str | None, connect: str | None, lines: ProgressLines) -> It
         yield endpoint
 
 
-def _scan(endpoint: str, method: Method, params: Mapping[str, Any], folder: Path, lines: ProgressLines) -> None:
-    """Start the job, follow it, fetch its files into place."""
+def _scan(endpoint: str, method: Method, params: Mapping[str, Any], place: Place, lines: ProgressLines) -> Path:
+    """Start the job, follow it, fetch its files into place; returns their folder."""
     from scanner.client import Client  # noqa: PLC0415
     from scanner.errors import StorageError  # noqa: PLC0415
     from scanner.session import raise_unless_done  # noqa: PLC0415
@@ -180,18 +200,19 @@ def _scan(endpoint: str, method: Method, params: Mapping[str, Any], folder: Path
     with Client(endpoint, name="fringed scan") as client:
         job_id = client.start_scan(method.value, **params)
         try:
-            raise_unless_done(client.wait(job_id, _follower(folder, lines)))
+            raise_unless_done(client.wait(job_id, _follower(place.folder, lines)))
             lines.stage("fetching files")
-            incoming = folder / INCOMING
-            client.fetch(job_id, incoming, lambda _, done, total: lines.advance(done, total))
+            with place.made() as folder:
+                client.fetch(job_id, folder / INCOMING, lambda _, done, total: lines.advance(done, total))
+                _into_place(folder / INCOMING, folder)
         except (KeyboardInterrupt, SystemExit, StorageError):
             _cancel(client, job_id)
             raise
-    _into_place(incoming, folder)
+    return folder
 
 
 def _follower(folder: Path, lines: ProgressLines) -> Callable[[Event], None]:
-    """Draws a job's events, and asks for room on the disk as soon as the plan says how much is needed."""
+    """Draws a job's events, and asks for room under `folder` as soon as the plan says how much is needed."""
     from scanner.storage import check_room  # noqa: PLC0415
 
     def follow(event: Event) -> None:

@@ -24,9 +24,7 @@ PATIENCE_S = 60.0
 
 
 def fringed(*words: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*FRINGED, *map(str, words)], capture_output=True, text=True, check=False, timeout=PATIENCE_S
-    )
+    return subprocess.run([*FRINGED, *map(str, words)], capture_output=True, text=True, check=False, timeout=PATIENCE_S)
 
 
 @contextmanager
@@ -99,6 +97,7 @@ def test_a_scan_that_is_killed_leaves_no_private_folder(tmp_path: Path) -> None:
             assert time.monotonic() < deadline
             time.sleep(0.02)
         scan.kill()
+    assert not (tmp_path / "out").exists()
     while list(private.iterdir()):
         assert time.monotonic() < deadline
         time.sleep(0.02)

@@ -1,0 +1,49 @@
+"""Output folders: looked at before the work, made after it, and nothing of a work that failed is left or kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from scanner.errors import StorageError
+from scanner.storage import try_output
+from service.commands.scan import INCOMING, Place
+
+
+def test_looking_leaves_nothing_and_finds_what_making_would(tmp_path: Path) -> None:
+    try_output(tmp_path / "deep" / "er")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").write_text("")
+    for refused in (tmp_path, tmp_path / "file", tmp_path / "file" / "in"):
+        with pytest.raises(StorageError):
+            try_output(refused)
+    try_output(tmp_path, force=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_files_of_a_killed_command_are_no_part_of_the_next_scan(tmp_path: Path) -> None:
+    stale = tmp_path / INCOMING / "cloud.ply"
+    stale.parent.mkdir()
+    stale.write_text("another scan's")
+    with Place(tmp_path, force=True).made() as folder:
+        assert folder == tmp_path
+        assert not stale.exists()
+
+
+def test_a_folder_whose_files_do_not_arrive_goes_again(tmp_path: Path) -> None:
+    def fail() -> None:
+        with Place(tmp_path / "a" / "b", force=False).made() as folder:
+            (folder / INCOMING).mkdir()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_a_name_a_folder_that_is_free_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    place = Place(None, force=False)
+    with place.made() as first, place.made() as second:
+        assert first != second
