@@ -1,11 +1,17 @@
-"""The documentation: generated pages are current, links lead somewhere, every decision has its four parts."""
+"""The documentation: generated pages are current, links lead somewhere, commands exist, decisions have four parts."""
 
 import importlib.util
 import re
+import shlex
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
+import typer
+
+from service.program import app
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -55,3 +61,41 @@ def test_every_decision_has_its_four_parts() -> None:
 
 def test_the_picture_in_the_readme_is_small() -> None:
     assert (DOCS / "images" / "scan.png").stat().st_size < 400_000
+
+
+def test_anchors_lead_somewhere() -> None:
+    for page in PAGES:
+        for link, anchor in re.findall(r"\]\((?!https?://)([^)#\s]*)#([^)]+)\)", page.read_text()):
+            target = (page.parent / link).resolve() if link else page
+            headings = re.findall(r"^#+ (.*)$", target.read_text(), flags=re.MULTILINE)
+            names = {re.sub(r"[^\w -]", "", heading).strip().lower().replace(" ", "-") for heading in headings}
+            assert anchor in names, f"{page.name}: {link}#{anchor}"
+
+
+def printed_commands() -> Iterator[tuple[str, str]]:
+    """(page, line) of each `fringed ...` that a reader may type: in backticks, or a line of its own."""
+    for page in [*PAGES, *(ROOT / "changelog.d").glob("*.md")]:
+        for line in page.read_text().splitlines():
+            found = re.findall(r"`(fringed [^`]+)`", line)
+            found += re.findall(r"^ {4,}(?:sudo )?(fringed .*?)(?: {3,}.*| +#.*)?$", line)
+            yield from ((page.name, words) for words in found if "COMMAND" not in words)
+
+
+def test_every_command_that_is_printed_exists_with_its_options() -> None:
+    wrong, checked = [], 0
+    for page, line in printed_commands():
+        command: Any = typer.main.get_command(app)
+        words = shlex.split(line)[1:]
+        while words and hasattr(command, "commands") and words[0] in command.commands:
+            command = command.commands[words.pop(0)]
+        known = {name for option in command.params for name in (*option.opts, *option.secondary_opts)}
+        options = {word for word in words if re.match(r"--?[a-z]", word)} - {
+            "--help",
+            "--debug",
+            "--install-completion",
+        }
+        if options - known or (hasattr(command, "commands") and words and not words[0].startswith("-")):
+            wrong.append(f"{page}: {line}")
+        checked += 1
+    assert wrong == []
+    assert checked > 100
