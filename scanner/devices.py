@@ -495,6 +495,15 @@ class KnowsPresence(Protocol):
         """
 
 
+@runtime_checkable
+class KeepsCounts(Protocol):
+    """A camera that counts what became of its frames."""
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Of the present run, or the last one, by the driver's own names: frames that came, were lost, sent again."""
+
+
 # --- devices that know the truth ---------------------------------------------------------------------------------
 
 

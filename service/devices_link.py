@@ -22,6 +22,7 @@ from service.pipe import (
     Began,
     CancelAcquire,
     Command,
+    Counted,
     DeviceFault,
     Devices,
     Discover,
@@ -95,8 +96,9 @@ class DevicesLink:
         self._discoveries: dict[int, asyncio.Future[list[dict[str, Any]]]] = {}
         self._looking: asyncio.Task[list[dict[str, Any]]] | None = None
         self._preview: Preview | None = None
+        self._counts: dict[str, int] = {}
         self.description: dict[str, Any] | None = None
-        """camera and projector as opened; None while there are none"""
+        """camera and projector as opened, and what became of the camera's frames; None while there are none"""
 
     @property
     def answers(self) -> bool:
@@ -284,6 +286,7 @@ class DevicesLink:
         match report:
             case Opened():
                 self.description = {"camera": report.camera, "projector": report.projector}
+                self._describe()
                 if self._opened is not None and not self._opened.done():
                     self._opened.set_result(report)
                 self._publish("device.opened", None, self.description)
@@ -292,6 +295,9 @@ class DevicesLink:
             case OpenFailed(error=error):
                 self._fail_opening(error_from_body(error))
                 self._publish("device.failed", None, {"error": error.message})
+            case Counted(counts=counts):
+                self._counts = counts
+                self._describe()
             case DeviceFault(error=error):
                 self.description = None
                 self._publish("device.lost", None, {"error": error.message})
@@ -302,8 +308,13 @@ class DevicesLink:
                 if (scan := self._scans.get(report.job)) is not None:
                     scan.put_nowait(report)
 
+    def _describe(self) -> None:
+        if self.description is not None and self._counts:
+            self.description["camera"]["counts"] = self._counts
+
     def _gone(self, status: int) -> None:
         was_open = self.description is not None
+        self._counts = {}
         self.description = None
         self._fail_opening(DeviceError(f"the devices process ended with status {status}", hint="look at the log"))
         self._opened = None

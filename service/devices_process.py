@@ -16,10 +16,12 @@ import queue
 import signal
 import sys
 import threading
+from collections import Counter
 from pathlib import Path
 from typing import BinaryIO
 
 from scanner.clock import Clock, MonotonicClock
+from scanner.devices import KeepsCounts
 from scanner.errors import DeviceError, DeviceLost, ScannerError
 from scanner.wire import error_body
 from service.acquisition import Scan
@@ -31,6 +33,7 @@ from service.pipe import (
     AcquireLive,
     CancelAcquire,
     Command,
+    Counted,
     Devices,
     Discover,
     Ended,
@@ -65,6 +68,7 @@ class DevicesProcess:
         self._devices = HeldDevices(clock, outbox.post)
         self._previewer: Previewer | None = None
         self._write_backs = WriteBacks()
+        self._counts: Counter[str] = Counter()
 
     def run(self) -> int:
         """Serve until the daemon is gone; returns the exit status."""
@@ -148,8 +152,14 @@ class DevicesProcess:
         finally:
             with self._lock:
                 self._scan = None
+        self._count(opened)
         if scan.lost is not None:
             self._lose(scan.lost)
+
+    def _count(self, opened: OpenRig) -> None:
+        if isinstance(camera := opened.rig.camera, KeepsCounts):
+            self._counts.update(camera.counts)
+            self._outbox.post(Counted(dict(self._counts)))
 
     def _lose(self, error: ScannerError) -> None:
         if self._previewer is not None:

@@ -170,6 +170,12 @@ class Devices(Struct, frozen=True, tag="devices"):
     devices: list[dict[str, Any]]
 
 
+class Counted(Struct, frozen=True, tag="counted"):
+    """What became of the camera's frames in all scans and live runs, by its driver's names."""
+
+    counts: dict[str, int]
+
+
 class DeviceFault(Struct, frozen=True, tag="fault"):
     """A device went away: all are given up, and `opened` follows when they are back."""
 
@@ -177,7 +183,21 @@ class DeviceFault(Struct, frozen=True, tag="fault"):
 
 
 Command = Open | Acquire | AcquireLive | Go | CancelAcquire | Preview | Discover
-Report = Opened | OpenFailed | Need | Began | Frames | LiveBegan | Shot | Kept | Taken | Ended | Devices | DeviceFault
+Report = (
+    Opened
+    | OpenFailed
+    | Need
+    | Began
+    | Frames
+    | LiveBegan
+    | Shot
+    | Kept
+    | Taken
+    | Ended
+    | Devices
+    | DeviceFault
+    | Counted
+)
 
 _commands: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)
 _reports: msgspec.msgpack.Decoder[Report] = msgspec.msgpack.Decoder(Report)

@@ -63,10 +63,15 @@ class AravisCamera:
         return self._capabilities
 
     @property
+    def counts(self) -> Mapping[str, int]:
+        """See `scanner.devices.KeepsCounts`; those of the library."""
+        stream = self._links.newest.stream
+        return dict(stream.counts() if stream is not None else self._ended_counts)
+
+    @property
     def details(self) -> dict[str, Any]:
         """What else there is to know: packet counters, the clock's fit, what was switched off, losses."""
         link = self._links.newest
-        stream = link.stream
         clock: dict[str, Any] = {"latched": link.clock.latched}
         if len(link.clock):
             clock |= {"rate": link.clock.rate, "residual_ns": round(link.clock.residual_ns)}
@@ -74,7 +79,7 @@ class AravisCamera:
             "address": link.address,
             "packet_size": self._packet_size,
             "payload_bytes": self._payload,
-            "stream": dict(stream.counts() if stream is not None else self._ended_counts),
+            "stream": dict(self.counts),
             "clock": clock,
             "switched_off": list(link.switched_off),
             "losses": self._links.losses,

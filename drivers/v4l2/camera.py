@@ -44,7 +44,7 @@ class V4l2Camera:
         self._streaming = False
         self._lent: int | None = None
         self._begun_ns = 0
-        self._count = FrameCount()
+        self._count, self._damaged = FrameCount(), 0
         try:
             kind = self._found.buffer_type("camera")
             assert kind is not None  # noqa: S101  # open_node made sure
@@ -94,6 +94,11 @@ class V4l2Camera:
             stamp_bound_ns=stamping.bound_ns,
         )
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """See `scanner.devices.KeepsCounts`; missing: numbers that no frame had."""
+        return {"frames": self._count.frames, "missing": self._count.missing, "damaged": self._damaged}
+
     def apply(self, settings: CameraSettings) -> CameraSettings:
         """Set and read back; see `scanner.devices.Camera.apply`."""
         self._check_open()
@@ -124,7 +129,7 @@ class V4l2Camera:
         for index in range(len(queue)):
             queue.put(index)
         self._begun_ns = self._clock.now_ns()
-        self._count = FrameCount()
+        self._count, self._damaged = FrameCount(), 0
         queue.on()
         self._streaming = True
 
@@ -257,6 +262,7 @@ class V4l2Camera:
     def _frame(self, taken: Dequeued, queue: BufferQueue) -> CameraFrame:
         pixels = self._capture.unpack(queue.views[taken.index][: taken.bytes_used], self._format)
         complete = pixels is not None and not taken.damaged
+        self._damaged += not complete
         if pixels is None:
             pixels = self._capture.black(self._format)
         exposed = self._stamping.exposure(taken, self._begun_ns, self._clock.now_ns(), self._name)

@@ -54,14 +54,19 @@ class FrameCount:
         self._raw: int | None = None
         self._unwrapped = 0
         self._last = -1
+        self.frames = self.missing = 0
+        """that were given a number; numbers between them that nobody had"""
 
     def next(self, sequence: int) -> int:
         """The count of the frame that the driver calls `sequence`."""
         step = 0 if self._raw is None else (sequence - self._raw + _HALF) % (2 * _HALF) - _HALF
         self._unwrapped = sequence if self._raw is None else self._unwrapped + step
         self._raw = sequence
-        self._last = max(self._last + 1, self._unwrapped)
-        return self._last
+        number = max(self._last + 1, self._unwrapped)
+        self.missing += number - self._last - 1 if self.frames else 0
+        self.frames += 1
+        self._last = number
+        return number
 
 
 class BufferQueue:

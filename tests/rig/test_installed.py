@@ -140,6 +140,10 @@ def test_it_may_open_its_devices_and_no_others() -> None:
 def test_a_member_of_the_clients_group_scans(ada: Visitor) -> None:
     outcome = ada.scan(**SHORT, folder="/home/ada/first")
     assert outcome.get("state") == "done", outcome
+    ada.ask("status", {})
+    counts = ada.hear("status")["devices"]["camera"]["counts"]
+    assert counts["frames"] >= 10
+    assert counts["damaged"] == 0
     rows = _rows("/home/ada/first")
     assert np.abs(rows - np.arange(vivid.HEIGHT)[:, np.newaxis]).max() < 0.1
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -10,10 +11,12 @@ import pytest
 
 from scanner.clock import VirtualClock
 from scanner.errors import ConfigError, DeviceLost, DeviceNotFound
+from scanner.wire import error_body
 from service import held_devices
 from service.config import simulated_rig
+from service.devices_link import DevicesLink
 from service.held_devices import HeldDevices
-from service.pipe import DeviceFault, Opened, Report
+from service.pipe import Counted, DeviceFault, Opened, Report
 from service.scan_setup import OpenRig, open_rig
 
 DEVICE = "quick/board"
@@ -137,3 +140,16 @@ def test_a_rig_that_fails_to_open_leaves_nothing_open(monkeypatch: pytest.Monkey
     with pytest.raises(ConfigError, match="gain"):
         open_rig(settings, VirtualClock())
     assert sorted(closed) == ["camera", "projector", "trigger"]
+
+
+def test_what_became_of_frames_is_in_the_status_and_outlives_a_loss() -> None:
+    link = DevicesLink({}, lambda *_: None)
+    opened = {"camera": {"name": "one"}, "projector": {"name": "two"}}
+    link._take(Opened(**copy.deepcopy(opened)))
+    assert link.description == opened
+    link._take(Counted({"missing": 3}))
+    link._take(DeviceFault(error_body(DeviceLost("gone"))))
+    assert link.description is None
+    link._take(Opened(**copy.deepcopy(opened)))
+    assert link.description is not None
+    assert link.description["camera"]["counts"] == {"missing": 3}

@@ -168,6 +168,7 @@ def test_an_exposure_is_no_longer_than_the_period() -> None:
 def test_frames_are_counted_on_past_numbers_given_twice_and_the_wrap(said: list[int], counted: list[int]) -> None:
     count = FrameCount()
     assert [count.next(sequence) for sequence in said] == counted
+    assert (count.frames, count.missing) == (len(said), counted[-1] - counted[0] + 1 - len(said))
 
 
 def _control(minimum: int, maximum: int, step: int) -> Control:
