@@ -28,6 +28,9 @@ FEWEST_SHARE = 0.3
 FEWEST_POINTS = 8
 """Of one view: a homography takes four, twice as many leave something to judge by."""
 
+LEAST_SIDE_PX = 24
+"""Of a picture: four squares a side with room for a corner's window."""
+
 
 @dataclass(frozen=True, eq=False)
 class Detection:
@@ -52,6 +55,9 @@ def detect(image: NDArray[Any], target: Target) -> Detection | NotFound:
         image: (H, W) grey levels of any range; NaN counts as black.
         target: what to look for.
     """
+    height, width = image.shape
+    if min(height, width) < LEAST_SIDE_PX:
+        return NotFound(f"a picture of {width} x {height} px is too small for a target")
     picture = np.nan_to_num(np.asarray(image, dtype=np.float32))
     top = float(np.percentile(picture, 99.5))
     if top <= 0:

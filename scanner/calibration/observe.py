@@ -119,7 +119,7 @@ def observe_capture(path: Path, name: str, target: Target) -> Observation | Left
             if pattern < len(sequence):
                 decoder.add(pattern, capture.frame(pattern))
         decoded = decoder.finish()
-        white = None if sequence.white is None else capture.frame(sequence.white)
+        white = capture.frame(sequence.white) if sequence.white in capture.records else None
     except SyncError as error:
         return LeftOut(name, f"frames out of step: {error}", out_of_step=True)
     except ScannerError as error:

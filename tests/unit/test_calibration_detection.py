@@ -74,6 +74,8 @@ def test_what_is_not_there_is_said() -> None:
         found = detect(empty, parse_target(spec))
         assert isinstance(found, NotFound)
         assert words in found.reason
+    for spec in ("chessboard:9x6:25", "circles:7x5:32"):
+        assert "too small" in str(detect(np.ones((1, 8), np.float32), parse_target(spec)))
     black = detect(np.full((60, 80), np.nan, np.float32), parse_target("chessboard:9x6:25"))
     assert isinstance(black, NotFound)
     assert "black" in black.reason

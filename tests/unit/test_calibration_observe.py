@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,17 @@ import pytest
 
 from drivers.simulated.rigs import rig
 from drivers.simulated.targets import target_points, target_poses
-from scanner.calibration.observe import LeftOut, Observation, find_captures, observe, observe_capture
+from scanner.calibration.observe import (
+    LeftOut,
+    Observation,
+    find_captures,
+    observe,
+    observe_capture,
+    observe_decoded,
+)
 from scanner.calibration.targets import parse_target
-from scanner.capture import CaptureHeader
+from scanner.capture import Capture, CaptureHeader
+from scanner.decode import decoder_for
 from scanner.errors import ConfigError
 from scanner.geometry import load_calibration
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
@@ -72,6 +81,52 @@ def test_points_of_a_simulated_pose(poses: Path) -> None:
     assert np.sqrt(((found.view.camera - camera) ** 2).mean()) < 0.04
     assert np.sqrt(((found.view.projector - projector) ** 2).mean()) < 0.1
     assert found.response == {"gamma": 2.3}
+
+
+def test_a_white_frame_is_where_the_target_is_looked_for_first(poses: Path, tmp_path: Path) -> None:
+    """One that is elsewhere moves the points; one that shows no target, or is missing, leaves them to the albedo."""
+    frames = np.load(poses / "p04" / "capture" / "frames.npy")
+    header = json.loads((poses / "p04" / "capture" / "capture.json").read_text())
+    header["pattern"]["white"] = len(frames)
+    bright = frames.max(axis=0)
+    lines = [json.dumps({"slot": k, "pattern": k, "attempt": 0, "status": "ok"}) for k in range(len(frames))]
+    found = {}
+    for name, white in (("moved", np.roll(bright, 3, axis=1)), ("black", 0 * bright), ("missing", bright)):
+        folder = tmp_path / name
+        folder.mkdir()
+        np.save(folder / "frames.npy", np.concatenate((frames, white[None])))
+        (folder / "capture.json").write_text(json.dumps(header))
+        if name == "missing":
+            (folder / "frames.jsonl").write_text("\n".join(lines) + "\n")
+        outcome = observe_capture(folder, name, TARGET)
+        assert isinstance(outcome, Observation), outcome
+        found[name] = outcome.view.camera
+    plain = observe_capture(poses / "p04" / "capture", "p04", TARGET)
+    assert isinstance(plain, Observation)
+    assert found["moved"] == pytest.approx(plain.view.camera + np.array([3.0, 0.0]), abs=0.1)
+    assert found["black"] == pytest.approx(plain.view.camera)
+    assert found["missing"] == pytest.approx(plain.view.camera)
+
+
+def test_points_on_a_line_or_hardly_any_do_not_serve(poses: Path) -> None:
+    """Of a board of which fringes reach one row, or a few points."""
+    capture = Capture.open(poses / "p04" / "capture")
+    decoder = decoder_for(capture.header.sequence, capture.header.camera)
+    for k in range(len(capture.header.sequence)):
+        decoder.add(k, capture.frame(k))
+    decoded = decoder.finish()
+    whole = observe_decoded("whole", decoded, TARGET)
+    assert not isinstance(whole, LeftOut)
+    across = whole.camera[:9].mean(axis=0), whole.camera[9:18].mean(axis=0)
+    y, x = np.indices(decoded.albedo.shape)
+    step = across[1] - across[0]
+    row = np.abs((x - across[0][0]) * step[0] + (y - across[0][1]) * step[1]) < 0.5 * step @ step
+    here = np.hypot(*(np.stack((x, y)) - whole.camera[20][:, None, None])) < 12
+    for lit, words in ((row, "lie on a line"), (here, "points only")):
+        dark = replace(decoded, **{name: np.where(lit, getattr(decoded, name), np.nan) for name in ("rows", "columns")})
+        outcome = observe_decoded("part", dark, TARGET)
+        assert isinstance(outcome, LeftOut)
+        assert words in outcome.reason
 
 
 def test_what_cannot_serve_says_why(poses: Path) -> None:
