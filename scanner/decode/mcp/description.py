@@ -80,17 +80,15 @@ def agreement(
         path: (P,) int32, -1 for stray peaks.
         columns: where columns begin (B + 1,), and the table to each peak (P,) of `hmm.gaps`; 0 is one pitch.
     """
-    words, of_word = np.unique(model.ratio > 0, axis=0, return_inverse=True)
-    of_word = of_word.ravel()
+    words, of_word = np.unique((model.ratio > 0) @ (1 << np.arange(model.channels)), return_inverse=True)
     start, gap = columns
     # Whole columns: every third peak, say, would be the same few stripes wherever columns are alike.
     column = np.repeat(np.arange(len(start) - 1), np.diff(start))
     thin = np.flatnonzero(column % max(1, len(path) // MOST_ASKED) == 0)
-    asked = evidence[thin]
-    each = np.stack([asked[:, of_word == w].max(axis=1) for w in range(len(words))], axis=1)
-    ranked = np.partition(each, -2, axis=1)
-    best = each.argmax(axis=1)
-    clear = (ranked[:, -1] - ranked[:, -2] > CLEAR) & words[best].any(axis=1)
+    each = np.full((len(thin), len(words)), -np.inf, np.float32)
+    best, ahead = np.zeros(len(thin), np.int32), np.zeros(len(thin), np.float32)
+    _best_words(evidence, thin, of_word, each, best, ahead)
+    clear = (ahead > CLEAR) & (words[best] != 0)
     agrees = (path[thin] >= 0) & (of_word[np.maximum(path[thin], 0)] == best)
     first = np.zeros(len(path), bool)
     first[start[:-1][start[:-1] < len(path)]] = True
@@ -103,6 +101,25 @@ def agreement(
     clear_share, agree, order, hits, wrapped = (float(part.mean()) if part.size else 0.0 for part in parts)
     exchanged = exchanged_words(each, places_in_order(path, first, gap)[thin], of_word, model)
     return Agreement(clear_share, agree, order, hits, wrapped, exchanged)
+
+
+@kernel
+def _best_words(
+    evidence: Array, thin: NDArray[np.intp], of_word: NDArray[np.intp], each: Array, best: Ints, ahead: Array
+) -> None:
+    """Of those peaks: the likelihood of each word's likeliest stripe, the best word, and how far the next is behind."""
+    for n in range(len(thin)):
+        k = thin[n]
+        for s in range(len(of_word)):
+            each[n, of_word[s]] = max(each[n, of_word[s]], evidence[k, s])
+        top, next_one = each[n, 0], -np.float32(np.inf)
+        for w in range(1, each.shape[1]):
+            value = each[n, w]
+            if value > top:
+                top, next_one, best[n] = value, top, w
+            else:
+                next_one = max(next_one, value)
+        ahead[n] = top - next_one
 
 
 def places_in_order(path: Ints, first: NDArray[np.bool_], gap: Ints) -> Ints:

@@ -6,6 +6,7 @@ Each window along a chain votes for the magnification at which most power lies o
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from scanner.decode.mcp.carriers import CarrierSearch, places
 from scanner.decode.mcp.linking import Chains
 from scanner.decode.mcp.model import PatternModel
+from scanner.decode.mcp.ranks import quantiles
 from scanner.decode.mcp.stripes import STEP, Peaks
 from scanner.kernel import summing_kernel
 
@@ -62,12 +64,13 @@ def fit_field(
     """
     x, y = places(peaks, chains, shape)
     base = search.relative(x, y) - 1
-    starts: list[int] = []
-    for first, last in zip(chains.start[:-1], chains.start[1:], strict=True):
-        starts.extend(range(int(first), int(last) - size // STEP + 1, max(1, size // (2 * STEP))))
+    hop = max(1, size // (2 * STEP))
+    windows = np.maximum((chains.lengths - size // STEP) // hop + 1, 0)
+    before = np.repeat(np.cumsum(windows) - windows, windows)
+    starts = np.repeat(chains.start[:-1], windows) + hop * (np.arange(len(before)) - before)
     if len(starts) < 8:
         return np.asarray(1 + base, np.float32)
-    begin = np.asarray(starts, np.int32)[:: max(1, len(starts) // MOST_WINDOWS)]
+    begin = starts.astype(np.int32)[:: max(1, len(starts) // MOST_WINDOWS)]
     middle = chains.order[begin + size // (2 * STEP)]
     value, weight = _votes(light, begin * STEP, base[middle], model, search.scale, size)
     design = np.stack([np.ones(len(x)), x, y, x * y], axis=1)
@@ -84,9 +87,7 @@ def _votes(
     lowest = int(np.floor((base.min() - FIELD_RANGE) / step))
     first = (np.rint((base - FIELD_RANGE) / step) - lowest).clip(0).astype(np.int32)
     tries = (lowest + np.arange(int(first.max()) + count)) * step
-    t = np.arange(size) - (size - 1) / 2
-    phase = 2 * np.pi * (model.carriers / (scale * (1 + tries[:, None])))[:, :, None] * t[None, None, :]
-    basis = np.concatenate([np.cos(phase), np.sin(phase)], axis=1).astype(np.float32)
+    basis = _waves(tuple(float(f) for f in model.carriers), scale, lowest, len(tries), size)
     power = np.zeros((len(begin), count), np.float32)
     mean = np.zeros(len(begin), np.float32)
     _powers(light, begin, first, np.hanning(size + 2)[1:-1].astype(np.float32), basis, mean, power)
@@ -99,6 +100,17 @@ def _votes(
     # A window counts by how far its best stands above its middle: those without carriers have none.
     weight = np.where(inside, top - np.median(power, axis=1), 0.0).clip(0, None)
     return tries[first + b] + np.clip(shift, -1, 1) * step, weight
+
+
+@lru_cache(maxsize=16)
+def _waves(carriers: tuple[float, ...], scale: float, lowest: int, count: int, size: int) -> Array:
+    """Cosines, then sines, of all carriers at each trial magnification: (count, 2 N, size). Frames of a series ask for
+    the same ones again and again: they are kept.
+    """
+    tries = (lowest + np.arange(count)) * 2 * FIELD_STEP
+    t = np.arange(size) - (size - 1) / 2
+    phase = 2 * np.pi * (np.asarray(carriers) / (scale * (1 + tries[:, None])))[:, :, None] * t[None, None, :]
+    return np.concatenate([np.cos(phase), np.sin(phase)], axis=1).astype(np.float32)
 
 
 @summing_kernel
@@ -129,7 +141,7 @@ def _powers(light: Array, starts: Ints, first: Ints, window: Array, basis: Array
 
 def _robust_fit(design: Any, value: Any, weight: Any, everywhere: Any) -> NDArray[np.float64]:
     """Weighted least squares with Cauchy weights, four rounds; evaluated on the rows of `everywhere`."""
-    w = np.minimum(weight, np.percentile(weight, 90)) + 1e-12
+    w = np.minimum(weight, quantiles(weight, 0.9)[0]) + 1e-12
     spread = FIELD_RANGE / 2
     ridge = np.diag([1e-9, 1e-3, 1e-3, 1e-2]) * w.sum()
     centre = float(np.average(value, weights=w))
@@ -139,5 +151,6 @@ def _robust_fit(design: Any, value: Any, weight: Any, everywhere: Any) -> NDArra
         residual = v - design @ solution
         c = w / (1 + (residual / spread) ** 2)
         solution = np.linalg.solve(design.T @ (c[:, None] * design) + ridge, design.T @ (c * v))
-        spread = max(float(np.sqrt(np.average((v - design @ solution) ** 2, weights=c))), FIELD_STEP)
+        left = v - design @ solution
+        spread = max(float(np.sqrt(c @ (left * left) / c.sum())), FIELD_STEP)
     return np.asarray(centre + everywhere @ solution)
