@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from scanner.errors import ScannerError
 from scanner.session import Call
-from scanner.wire import TERMINAL_STATES, ErrorBody, LiveHeader, decode_live, error_from_body
+from scanner.wire import TERMINAL_STATES, ErrorBody, error_from_body
+from scanner.wire_images import LiveHeader, decode_live
 
 if TYPE_CHECKING:
     from scanner.geometry import Calibration

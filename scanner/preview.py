@@ -97,7 +97,7 @@ def _figures(scan: Scan) -> list[tuple[str, str]]:
         low, high = np.percentile(depth, (1, 99))
         figures.append((f"{grouped(low)} … {grouped(high)}", "mm depth"))
     if scan.sigma_z is not None and (sigma := _sample(scan.sigma_z)).size:
-        figures.append((f"{np.median(sigma):.3f}", "mm noise (median σ)"))
+        figures.append((f"{np.median(sigma):.3f}", "mm random error (median σ)"))
     return figures
 
 

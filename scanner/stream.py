@@ -13,8 +13,7 @@ from typing import Any, Literal
 import msgspec
 from msgspec import Struct
 
-from scanner.errors import ProtocolError
-from scanner.wire import ErrorBody, FileEntry
+from scanner.wire import ErrorBody, FileEntry, decoded
 
 EndReason = Literal[
     "completed",
@@ -221,10 +220,7 @@ def decode_from_worker(data: bytes) -> FromWorker:
     Raises:
         ProtocolError: it is none.
     """
-    try:
-        return _from_worker.decode(data)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise ProtocolError(f"not a worker's message: {error}") from error
+    return decoded(_from_worker, data, "a worker's message")
 
 
 def decode_to_worker(data: bytes) -> ToWorker:
@@ -233,7 +229,4 @@ def decode_to_worker(data: bytes) -> ToWorker:
     Raises:
         ProtocolError: it is none.
     """
-    try:
-        return _to_worker.decode(data)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise ProtocolError(f"not a message to a worker: {error}") from error
+    return decoded(_to_worker, data, "a message to a worker")

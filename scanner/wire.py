@@ -1,8 +1,8 @@
 """The messages between a client and the daemon, as types and bytes: JSON-RPC 2.0 members in MessagePack.
 
 No socket is opened here; `scanner.session` holds a client's side of the conversation, `scanner.stream` the messages
-between daemon and worker. The specification for other languages is docs/reference/protocol.md; its bytes are made
-from these types.
+between daemon and worker, `scanner.wire_images` those with pixels. The specification for other languages is
+docs/reference/protocol.md; its bytes are made from these types.
 """
 
 from __future__ import annotations
@@ -100,48 +100,6 @@ class Notification(Struct, frozen=True, kw_only=True):
     jsonrpc: Literal["2.0"] = "2.0"
     method: Literal["event"] = "event"
     params: Event
-
-
-class PreviewHeader(Struct, frozen=True, kw_only=True):
-    """Header of a preview or live message. Numbered, so that dropped ones are counted."""
-
-    number: int
-    width: int
-    height: int
-    dtype: Literal["uint8", "uint16"]
-    t_ns: int
-    stride: int = 1
-    """camera pixels per preview pixel"""
-
-
-class LiveHeader(Struct, frozen=True, kw_only=True):
-    """Header of a live result. Times are CLOCK_MONOTONIC, ns."""
-
-    number: int
-    """counts camera frames of this run from 0: a difference above 1 is what was dropped in between"""
-    job: str
-    content: Literal["rows", "columns", "xyz"]
-    width: int
-    height: int
-    """of the image that follows, px; 0 where there is none (`error`)"""
-    dtype: Literal["uint16", "float32"]
-    stride: int = 1
-    """camera pixels from one value to the next, both ways"""
-    scale: float = 0.0
-    """rows and columns: value = round((row + 0.5) * scale), 0 = none; xyz: 0"""
-    points: int = 0
-    """pixels of the camera's image with a value (xyz: with a point, after the filters)"""
-    frame_id: int = 0
-    """the camera's own count"""
-    start_ns: int = 0
-    end_ns: int = 0
-    """the frame's exposure, first row's start to last row's end"""
-    sent_ns: int = 0
-    """when this message was given to the socket: minus `end_ns` it is the latency"""
-    decode_ms: float = 0.0
-    """time of decoding and, for xyz, of triangulation and filters"""
-    error: str | None = None
-    """why this frame gave nothing"""
 
 
 # --- parameters ---------------------------------------------------------------------------------------------------
@@ -243,14 +201,13 @@ class FileEntry(Struct, frozen=True):
 
 # --- bytes --------------------------------------------------------------------------------------------------------
 
+_T = TypeVar("_T")
 _Params = TypeVar("_Params", bound=Struct)
 
 _encoder = msgspec.msgpack.Encoder()
 _requests = msgspec.msgpack.Decoder(Request)
 _responses = msgspec.msgpack.Decoder(Response)
 _notifications = msgspec.msgpack.Decoder(Notification)
-_headers = msgspec.msgpack.Decoder(PreviewHeader)
-_live_headers = msgspec.msgpack.Decoder(LiveHeader)
 
 
 def encode(message: Struct) -> bytes:
@@ -310,16 +267,25 @@ def request_id(data: bytes) -> int | str | None:
     return found if isinstance(found, int | str) and not isinstance(found, bool) else None
 
 
+def decoded(decoder: msgspec.msgpack.Decoder[_T], data: bytes | memoryview, what: str) -> _T:
+    """Read a message that is `what`.
+
+    Raises:
+        ProtocolError: it is not.
+    """
+    try:
+        return decoder.decode(data)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise ProtocolError(f"not {what}: {error}") from error
+
+
 def decode_response(data: bytes) -> Response:
     """Read an answer.
 
     Raises:
         ProtocolError: it is none.
     """
-    try:
-        return _responses.decode(data)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise ProtocolError(f"the daemon's answer is not a JSON-RPC response: {error}") from error
+    return decoded(_responses, data, "a JSON-RPC response from the daemon")
 
 
 def decode_event(data: bytes) -> Event:
@@ -328,10 +294,7 @@ def decode_event(data: bytes) -> Event:
     Raises:
         ProtocolError: it is no event.
     """
-    try:
-        return _notifications.decode(data).params
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise ProtocolError(f"not an event: {error}") from error
+    return decoded(_notifications, data, "an event").params
 
 
 def params_as(kind: type[_Params], request: Request) -> _Params:
@@ -358,55 +321,6 @@ def error_from_body(body: ErrorBody) -> ScannerError:
     if body.data.get("class") == ProtocolError.__name__ and isinstance(reason, str):
         return Refused(body.message, reason=reason, hint=body.data.get("hint"))
     return from_data(body.message, body.data)
-
-
-def encode_preview(header: PreviewHeader, pixels: bytes | memoryview) -> bytes:
-    """One part: 4-byte little-endian length of the header, header, pixels."""
-    head = _encoder.encode(header)
-    return b"".join((len(head).to_bytes(4, "little"), head, pixels))
-
-
-def decode_preview(data: bytes) -> tuple[PreviewHeader, memoryview]:
-    """Header and pixels, height x width, of a preview message.
-
-    Raises:
-        ProtocolError: it is none, or its length contradicts its header.
-    """
-    view = memoryview(data)
-    length = int.from_bytes(view[:4], "little")
-    try:
-        header = _headers.decode(view[4 : 4 + length])
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise ProtocolError(f"not a preview: {error}") from error
-    pixels = view[4 + length :]
-    if len(pixels) != header.width * header.height * (2 if header.dtype == "uint16" else 1):
-        raise ProtocolError(f"a preview of {header.width} x {header.height} with {len(pixels)} bytes")
-    return header, pixels
-
-
-def encode_live(header: LiveHeader, values: bytes | memoryview) -> bytes:
-    """One part: 4-byte little-endian length of the header, header, values (little-endian, row by row)."""
-    head = _encoder.encode(header)
-    return b"".join((len(head).to_bytes(4, "little"), head, values))
-
-
-def decode_live(data: bytes) -> tuple[LiveHeader, memoryview]:
-    """Header and values of a live result: height x width (x 3 for xyz).
-
-    Raises:
-        ProtocolError: it is none, or its length contradicts its header.
-    """
-    view = memoryview(data)
-    length = int.from_bytes(view[:4], "little")
-    try:
-        header = _live_headers.decode(view[4 : 4 + length])
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise ProtocolError(f"not a live result: {error}") from error
-    values = view[4 + length :]
-    each = {"uint16": 2, "float32": 4}[header.dtype] * (3 if header.content == "xyz" else 1)
-    if header.width < 0 or header.height < 0 or len(values) != header.width * header.height * each:
-        raise ProtocolError(f"a live result of {header.width} x {header.height} with {len(values)} bytes")
-    return header, values
 
 
 # --- endpoints ----------------------------------------------------------------------------------------------------

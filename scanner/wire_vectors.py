@@ -38,17 +38,14 @@ from scanner.wire import (
     PROTOCOL,
     Event,
     FileEntry,
-    LiveHeader,
     Notification,
-    PreviewHeader,
     Refused,
     Request,
     Response,
     encode,
-    encode_live,
-    encode_preview,
     error_body,
 )
+from scanner.wire_images import LiveHeader, PreviewHeader, encode_image
 
 JOB = "0b3e3a52-9f0e-4c52-8a55-3f1d8f3b6a11"
 DELIVERY = 1753233956852223
@@ -299,7 +296,7 @@ def vectors() -> list[dict[str, str | Any]]:
             "name": "preview",
             "direction": "daemon to subscribers",
             "message": {"header": msgspec.to_builtins(header), "pixels": {"bytes": "00407fff"}},
-            "hex": encode_preview(header, bytes([0, 64, 127, 255])).hex(),
+            "hex": encode_image(header, bytes([0, 64, 127, 255])).hex(),
         }
     )
     live = LiveHeader(
@@ -323,7 +320,7 @@ def vectors() -> list[dict[str, str | Any]]:
             "name": "live",
             "direction": "worker to subscribers",
             "message": {"header": msgspec.to_builtins(live), "values": {"bytes": rows.hex()}},
-            "hex": encode_live(live, rows).hex(),
+            "hex": encode_image(live, rows).hex(),
         }
     )
     to_daemon = (Ready, Ack, Progress, DecodedNote, LiveCounts, Result, Failed, Released, Alive, Leaving)

@@ -30,7 +30,8 @@ from scanner.client import Client
 from scanner.client_sockets import conflated
 from scanner.errors import CalibrationError, DecodeError, SyncError
 from scanner.session import raise_unless_done
-from scanner.wire import Event, decode_preview
+from scanner.wire import Event
+from scanner.wire_images import decode_preview
 
 POSES = "poses"
 INCOMING = ".incoming"

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from scanner.durations import Durations
 from scanner.errors import DecodeError, ProtocolError, ScannerError
 from scanner.stream import FromWorker, LiveBegin, LiveCounts, LiveFrame
-from scanner.wire import MAX_MESSAGE_BYTES, LiveHeader, encode_live, ipc_path
+from scanner.wire import MAX_MESSAGE_BYTES, ipc_path
+from scanner.wire_images import LiveHeader, encode_image
 from service.sockets import remove_sockets
 
 if TYPE_CHECKING:
@@ -221,7 +222,7 @@ class _Publisher:
                 self._next += 1
                 if ready is not None:
                     sent = time.monotonic_ns()
-                    data = encode_live(structs.replace(ready.header, sent_ns=sent), ready.values)
+                    data = encode_image(structs.replace(ready.header, sent_ns=sent), ready.values)
                     self._socket.send(data, zmq.DONTWAIT, copy=False)
                     out.append((ready, sent))
         return out

@@ -16,7 +16,8 @@ import zmq
 from scanner.clock import Clock
 from scanner.devices import Image, TriggerMode
 from scanner.sequencer import Rig
-from scanner.wire import MAX_MESSAGE_BYTES, PreviewHeader, encode_preview
+from scanner.wire import MAX_MESSAGE_BYTES
+from scanner.wire_images import PreviewHeader, encode_image
 from service.pipe import Preview
 from service.sockets import remove_sockets
 
@@ -76,7 +77,7 @@ class Previewer:
             stride=stride,
         )
         with suppress(zmq.Again):
-            self._socket.send(encode_preview(header, small.data.cast("B")), zmq.DONTWAIT)
+            self._socket.send(encode_image(header, small.data.cast("B")), zmq.DONTWAIT)
 
     def rest(self) -> bool:
         """Stop the camera for a scan; the next `show` starts it again. Whether it ran."""

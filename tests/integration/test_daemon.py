@@ -18,7 +18,8 @@ import zmq
 
 from scanner.client import AsyncClient, Client
 from scanner.errors import ConfigError, DeviceLost, StorageError, Unreachable
-from scanner.wire import MAX_REQUEST_BYTES, Event, Refused, decode_preview
+from scanner.wire import MAX_REQUEST_BYTES, Event, Refused
+from scanner.wire_images import decode_preview
 from service.config import RigConfig, load_rig
 from service.private import private_daemon
 

@@ -26,7 +26,7 @@ from scanner.reconstruct_live import quantised, row_scale
 from scanner.sequencer import Rig, endless
 from scanner.series import read_series, recording_at, segment_name
 from scanner.stream import LiveBegin, LiveCounts, LiveFrame
-from scanner.wire import LiveHeader, encode_live
+from scanner.wire_images import LiveHeader, encode_image
 from service.live_files import close_recording, recorded_files, reserve
 from service.live_series import LiveSeries, LiveTotals
 from service.live_storage import FrameRing, Recording, ring_slots
@@ -202,7 +202,7 @@ def test_rows_cross_the_wire_to_half_a_step(values: list[float | None]) -> None:
     plain = np.nan_to_num(np.clip(np.floor((rows + np.float32(0.5)) * np.float32(scale) + np.float32(0.5)), 1, 65535))
     np.testing.assert_array_equal(sent, plain.astype(np.uint16))
     header = head(0, width=rows.shape[1], height=1, scale=scale)
-    found = LiveWatch("run").result(encode_live(header, sent.data.cast("B")))
+    found = LiveWatch("run").result(encode_image(header, sent.data.cast("B")))
     assert found is not None
     assert found.rows is not None
     # At the very top the least value, 1, is a whole step away from row -0.5.
@@ -217,13 +217,13 @@ def head(number: int, **members: Any) -> LiveHeader:
 
 def test_a_client_counts_what_it_missed_and_takes_its_own_run_only() -> None:
     watch = LiveWatch("run")
-    assert [f.missed for n in (2, 3, 7) if (f := watch.result(encode_live(head(n), b"\1\0")))] == [2, 0, 3]
+    assert [f.missed for n in (2, 3, 7) if (f := watch.result(encode_image(head(n), b"\1\0")))] == [2, 0, 3]
     assert watch.missed == 5
-    assert watch.result(encode_live(head(6), b"\1\0")) is None
+    assert watch.result(encode_image(head(6), b"\1\0")) is None
     other = LiveHeader(number=9, job="another", content="rows", width=0, height=0, dtype="uint16")
-    assert watch.result(encode_live(other, b"")) is None
+    assert watch.result(encode_image(other, b"")) is None
     with pytest.raises(ProtocolError):
-        watch.result(encode_live(head(9), b"\1"))
+        watch.result(encode_image(head(9), b"\1"))
 
 
 def test_a_client_learns_of_the_end_from_the_state() -> None:
@@ -248,10 +248,10 @@ def test_pictures_of_rows_and_of_nothing(tmp_path: Path) -> None:
     rows = 2 * y + 0.5 * x
     np.testing.assert_allclose(relief(rows), 0, atol=1e-3)
     rows[20:30, 20:30] = np.nan
-    frame = LiveWatch("run").result(encode_live(head(0, width=80, height=60), quantised(rows, 75.0)[0].data.cast("B")))
+    frame = LiveWatch("run").result(encode_image(head(0, width=80, height=60), quantised(rows, 75.0)[0].data.cast("B")))
     assert frame is not None
     assert encoded(live_picture(frame), ".png").startswith(b"\x89PNG")
-    empty = LiveWatch("run").result(encode_live(head(0, width=0, height=0, error="no stripes"), b""))
+    empty = LiveWatch("run").result(encode_image(head(0, width=0, height=0, error="no stripes"), b""))
     assert empty is not None
     assert (empty.rows, empty.xyz, empty.error) == (None, None, "no stripes")
     assert live_picture(empty).shape == live_picture(frame).shape

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scanner import stream, wire, wire_vectors
+from scanner import stream, wire, wire_images, wire_vectors
 from scanner.errors import DeviceLost, ProtocolError, ScannerError, SyncError
 from scanner.session import JobWatch, Session
 from scanner.wire import Event, Notification, Refused, Request, Response
@@ -24,8 +24,8 @@ READERS: tuple[Callable[[bytes], object], ...] = (
     wire.decode_request,
     wire.decode_response,
     wire.decode_event,
-    wire.decode_preview,
-    wire.decode_live,
+    wire_images.decode_preview,
+    wire_images.decode_live,
     stream.decode_from_worker,
     stream.decode_to_worker,
 )
@@ -69,12 +69,12 @@ def test_any_bytes_are_refused_in_words(data: bytes) -> None:
 
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**40))
 def test_preview_round_trip(width: int, height: int, number: int) -> None:
-    header = wire.PreviewHeader(number=number, width=width, height=height, dtype="uint16", t_ns=1)
+    header = wire_images.PreviewHeader(number=number, width=width, height=height, dtype="uint16", t_ns=1)
     pixels = bytes(2 * width * height)
-    found, seen = wire.decode_preview(wire.encode_preview(header, pixels))
+    found, seen = wire_images.decode_preview(wire_images.encode_image(header, pixels))
     assert (found, bytes(seen)) == (header, pixels)
     with pytest.raises(ProtocolError):
-        wire.decode_preview(wire.encode_preview(header, pixels[1:]))
+        wire_images.decode_preview(wire_images.encode_image(header, pixels[1:]))
 
 
 @pytest.mark.parametrize(
@@ -169,11 +169,11 @@ def test_recorded_bytes_mean_what_they_say() -> None:
     content = json.loads((REFERENCE / "protocol-vectors.json").read_text(encoding="utf-8"))
     for vector in content["vectors"]:
         if vector["name"] == "preview":
-            header, pixels = wire.decode_preview(bytes.fromhex(vector["hex"]))
+            header, pixels = wire_images.decode_preview(bytes.fromhex(vector["hex"]))
             assert (header.width * header.height, pixels.hex()) == (4, vector["message"]["pixels"]["bytes"])
             continue
         if vector["name"] == "live":
-            live, values = wire.decode_live(bytes.fromhex(vector["hex"]))
+            live, values = wire_images.decode_live(bytes.fromhex(vector["hex"]))
             assert (live.width * live.height, values.hex()) == (4, vector["message"]["values"]["bytes"])
             continue
         found = msgpack.unpackb(bytes.fromhex(vector["hex"]))
