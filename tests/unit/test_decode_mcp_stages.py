@@ -85,6 +85,20 @@ def test_peaks_of_a_triangle_wave():
     np.testing.assert_array_equal(fine.whole, np.arange(132) % 11 > 0)
 
 
+@pytest.mark.parametrize("share", [0.15, 0.4])
+def test_an_edge_of_print_beside_the_peak_moves_it_little(share):
+    y = np.arange(400)
+    light = 1 - np.abs(2 * ((y - 7.25) / 40 % 1) - 1)
+    printed = np.where((y - 27.25) % 80 > 11, share, 1.0)  # from 11 px below each second peak to 29 px below the next
+    reduced = np.tile(np.float32(10 + 80 * light * printed), (12, 1))
+    peaks = stripes.find_peaks(reduced, 40.0, 16.0, 0.1)
+    label = np.tile(np.arange(11, dtype=np.int32), 12)
+    fine = subpixel.refine(reduced, peaks, linking.link(peaks, 40.0), label, 40.0)
+    whole = np.flatnonzero(fine.whole[1:11]) + 1
+    np.testing.assert_allclose(fine.y[whole], 27.25 + 40 * (whole - 1), atol=0.4)
+    assert len(whole) >= 5
+
+
 @pytest.mark.parametrize("end", ["top", "bottom"])
 def test_a_stripe_that_leaves_the_image_is_followed_to_its_border(end):
     y, columns = np.arange(200), np.arange(45)

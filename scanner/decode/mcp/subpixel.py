@@ -35,6 +35,18 @@ ROUGH = np.float32(0.1)
 """Residual of the odd part, as a share of the stripe's height, above which it is no whole stripe: a triangle cut off at
 a third of its flank leaves as much."""
 
+EDGE = 0.01
+EDGE_SIGMA = np.float32(0.15)
+SHADED = np.float32(0.3)
+CLEARLY = np.float32(2.5)
+"""A fit that is so many pitches, and so many of its own sigmas, from the peak itself, with a residual that shading does
+not leave (its sigma, in the same measure), saw an edge of depth or print in its window: the peak's top, a window of a
+twelfth of a pitch, saw less of it."""
+
+LEAN = 0.04
+"""How far a slope of brightness moves a peak's top, in squared pitches: height over curvature there, of a triangle that
+a Gaussian of a twelfth of a pitch has rounded (.038; with a pixel of blur before it .042 at most)."""
+
 FEW = 4
 SMOOTH = np.float32(0.01)
 """A fit to fewer samples, at the image's border, leaves no residual worth the name: such a share of the height is taken
@@ -83,7 +95,7 @@ def refine(reduced: Array, peaks: Peaks, chains: Chains, label: Ints, pitch: flo
     count = len(peaks)
     y, sigma, whole = peaks.y.copy(), np.full(count, np.float32(0.5)), np.zeros(count, np.uint8)
     bend = _bends(guess, peaks.start, label, np.float32(pitch))
-    sides = (peaks.above, peaks.below, peaks.valley, peaks.height)
+    sides = (peaks.y, peaks.above, peaks.below, peaks.valley, peaks.height)
     _refine(reduced, guess, led, *sides, bend, chains.column, runs, ends, reach, y, sigma, whole)
     return Fine(y, sigma, whole)
 
@@ -253,6 +265,7 @@ def _refine(
     reduced: Array,
     guess: Array,
     led: NDArray[np.bool_],
+    top: Array,
     above: Array,
     below: Array,
     valley: Array,
@@ -272,6 +285,8 @@ def _refine(
     ground, kappa, worth = np.empty(longest, np.float32), np.empty(longest, np.float32), np.empty(longest, np.float32)
     usable, used = np.zeros(longest, np.int32), np.zeros(longest, np.int32)
     sums = np.empty((longest, 6), np.float32)
+    edge = np.float32(EDGE / REACH) * np.float32(reach)
+    lean = np.float32(LEAN / REACH / REACH) * np.float32(reach * reach)
     for r in range(len(ends) - 1):
         first, count = ends[r], ends[r + 1] - ends[r]
         for p in range(count):
@@ -303,6 +318,11 @@ def _refine(
                 rough = max(rough, SMOOTH * height[k])
             sigma[k] = ALIKE * rough / np.sqrt(ss) + SIGMA_FLOOR
             y[k] = guess[k] + shift
+            # Shading moves the top, and leaves little else.
+            explained = slope * lean if sigma[k] < edge * SHADED else np.float32(0)
+            apart = abs(y[k] + explained - top[k])
+            if used[p] >= FEW and sigma[k] > edge * EDGE_SIGMA and apart > max(edge, CLEARLY * sigma[k]):
+                y[k], sigma[k] = top[k], max(sigma[k], np.float32(0.25) * apart)
             far = abs(shift) > np.float32(0.35) * np.float32(reach)
             whole[k] = 0 if far or rough > ROUGH * height[k] else 1
 
