@@ -14,12 +14,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from scanner.errors import ConfigError
-from scanner.kernel import kernel
+from scanner.fragments import small_fragments
+from scanner.kernel import contracting_kernel, kernel
 
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -42,6 +42,9 @@ specks: the fragment filter then leaves it alone. A noisy background around one 
 LINE_SHARE = 0.5
 """If this share of all points has a neighbour along one axis of the image and none along the other, they lie on lines
 one pixel wide, sparse by the method as well (MCP's reference decoder: stripe peaks), however long the lines are."""
+
+_QUIET = 0.6745 * math.sqrt(6.0)
+"""Median of second differences over sigma, of depths exactly as noisy as sigma says."""
 
 BOX_KEYS = ("xmin:xmax", "ymin:ymax", "zmin:zmax")
 
@@ -137,18 +140,19 @@ def apply_filters(xyz: Map, sigma_z: Map, confidence: Map, settings: FilterSetti
     keep = there.copy()
     removed: dict[str, int] = {}
 
-    def take(name: str, falls: Mask) -> None:
-        before = int(np.count_nonzero(keep))
-        np.logical_and(keep, ~falls, out=keep)
-        removed[name] = before - int(np.count_nonzero(keep))
+    def take(name: str, falls: Mask | None) -> None:
+        removed[name] = 0
+        if falls is not None:
+            before = int(np.count_nonzero(keep))
+            np.greater(keep, falls, out=keep)
+            removed[name] = before - int(np.count_nonzero(keep))
 
-    nothing = np.broadcast_to(np.bool_(False), keep.shape)
-    take("confidence", confidence < settings.min_confidence if settings.min_confidence > 0 else nothing)
-    take("edges", at_depth_edge(xyz, sigma_z, keep, settings.max_angle_deg) if settings.edges else nothing)
-    take("depth", _outside(z, settings.depth) if settings.depth else nothing)
-    take("box", _outside_box(xyz, settings.box) if settings.box else nothing)
-    take("fragments", _in_fragment(keep, settings.min_fragment) if settings.edges else nothing)
-    return there & ~keep, removed
+    take("confidence", confidence < settings.min_confidence if settings.min_confidence > 0 else None)
+    take("edges", at_depth_edge(xyz, sigma_z, keep, settings.max_angle_deg) if settings.edges else None)
+    take("depth", _outside(z, settings.depth) if settings.depth else None)
+    take("box", _outside_box(xyz, settings.box) if settings.box else None)
+    take("fragments", _in_fragment(keep, settings.min_fragment) if settings.edges else None)
+    return np.greater(there, keep), removed
 
 
 def at_depth_edge(xyz: Map, sigma_z: Map, there: Mask, max_angle_deg: float = DEFAULT_MAX_ANGLE_DEG) -> Mask:
@@ -169,19 +173,25 @@ def noise_factor(z: Map, sigma_z: Map) -> float:
     From second differences along lines, z[j-1] - 2 z[j] + z[j+1], which see noise (sqrt 6 sigma) and hardly any shape;
     their median is blind to edges.
     """
-    lines, sigmas = z[::4], sigma_z[::4]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        second = np.abs(lines[:, :-2] - 2 * lines[:, 1:-1] + lines[:, 2:]) / sigmas[:, 1:-1]
-    second = second[np.isfinite(second)]
-    if second.size < 100:
-        return 1.0
-    return max(1.0, float(np.median(second)) / (0.6745 * math.sqrt(6.0)))
+    second = np.empty(-(-z.shape[0] // 4) * z.shape[1], np.float32)
+    count, quiet = _second_differences(z, sigma_z, np.float32(_QUIET), second)
+    if count < 100 or quiet > count // 2:
+        return 1.0  # both values in the middle lie below the limit
+    return max(1.0, _median(second[:count]) / _QUIET)
+
+
+def _median(values: NDArray[np.float32]) -> float:
+    # np.median looks for NaN as well, at ten times the price.
+    middle = values.size // 2
+    parted = np.partition(values, middle)
+    low = parted[middle] if values.size % 2 else parted[:middle].max()
+    return float((low + parted[middle]) * np.float32(0.5))
 
 
 def warm_up() -> None:
     """Compile the kernels."""
     xyz, z = np.ones((2, 2, 3), np.float32), np.ones((2, 2), np.float32)
-    _mark_edges(xyz, z, np.ones((2, 2), np.bool_), 5.7, 1.0, np.zeros((2, 2), np.bool_))
+    at_depth_edge(xyz, z, np.ones((2, 2), np.bool_))
 
 
 def _parse(text: str, name: str, keys: tuple[str, ...]) -> list[tuple[float, float]]:
@@ -234,12 +244,10 @@ def _in_fragment(there: Mask, min_pixels: int) -> Mask:
     """(H, W) bool: pixels in connected regions (4 neighbours) smaller than `min_pixels`."""
     if min_pixels <= 1:
         return np.zeros_like(there)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(there.view(np.uint8), connectivity=4, ltype=cv2.CV_32S)
-    small = stats[:, cv2.CC_STAT_AREA] < min_pixels
-    small[0] = False
-    if stats[small, cv2.CC_STAT_AREA].sum() > SPARSE_SHARE * np.count_nonzero(there) or _on_lines(there):
+    falls, count = small_fragments(there, min_pixels)
+    if count > SPARSE_SHARE * np.count_nonzero(there) or _on_lines(there):
         return np.zeros_like(there)
-    return np.asarray(small[labels], dtype=np.bool_)
+    return falls
 
 
 def _on_lines(there: Mask) -> bool:
@@ -252,18 +260,77 @@ def _on_lines(there: Mask) -> bool:
     return bool(np.count_nonzero(there & (beside ^ above)) > LINE_SHARE * np.count_nonzero(there))
 
 
+@contracting_kernel
+def _second_differences(z: Map, sigma_z: Map, limit: np.float32, out: NDArray[np.float32]) -> tuple[int, int]:
+    """|z[j-1] - 2 z[j] + z[j+1]| / sigma_z[j] of every fourth line, where finite: how many, and how many <= limit."""
+    count, quiet = 0, 0
+    for i in range(0, z.shape[0], 4):
+        for j in range(1, z.shape[1] - 1):
+            ratio = abs(z[i, j - 1] - np.float32(2) * z[i, j] + z[i, j + 1]) / sigma_z[i, j]
+            out[count] = ratio
+            finite = ratio < np.float32(np.inf)
+            count += finite
+            quiet += finite & (ratio <= limit)
+    return count, quiet
+
+
 @kernel
 def _mark_edges(xyz: Map, sigma_z: Map, there: Mask, steepest: float, noise: float, edge: Mask) -> None:
     """Mark both pixels of every pair of neighbours whose step along the line of sight no surface explains."""
     height, width = there.shape
+    here, below = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
+    across, down = np.zeros(width, np.uint8), np.zeros(width, np.uint8)
+    steepest2 = np.float32(steepest * steepest)
+    _split(xyz[0], here)
     for i in range(height):
-        for j in range(width):
-            if not there[i, j]:
-                continue
-            if j + 1 < width and there[i, j + 1] and _jump(xyz, sigma_z, i, j, i, j + 1, steepest, noise):
-                edge[i, j] = edge[i, j + 1] = True
-            if i + 1 < height and there[i + 1, j] and _jump(xyz, sigma_z, i, j, i + 1, j, steepest, noise):
-                edge[i, j] = edge[i + 1, j] = True
+        if _may_jump(here, 0, here, 1, width - 1, steepest2, across):
+            for j in range(width - 1):
+                if across[j] == 0 or not (there[i, j] and there[i, j + 1]):
+                    continue
+                if _jump(xyz, sigma_z, i, j, i, j + 1, steepest, noise):
+                    edge[i, j] = edge[i, j + 1] = True
+        if i + 1 == height:
+            return
+        _split(xyz[i + 1], below)
+        if _may_jump(here, 0, below, 0, width, steepest2, down):
+            for j in range(width):
+                if down[j] == 0 or not (there[i, j] and there[i + 1, j]):
+                    continue
+                if _jump(xyz, sigma_z, i, j, i + 1, j, steepest, noise):
+                    edge[i, j] = edge[i + 1, j] = True
+        here, below = below, here
+
+
+@contracting_kernel
+def _split(points: Map, line: Map) -> None:
+    for j in range(points.shape[0]):
+        line[0, j], line[1, j], line[2, j] = points[j, 0], points[j, 1], points[j, 2]
+
+
+@contracting_kernel
+def _may_jump(
+    ones: Map, at: int, others: Map, other_at: int, count: int, steepest2: np.float32, found: NDArray[np.uint8]
+) -> bool:
+    """Which of `count` pairs of points may lie steeper than `steepest2` (squared) allows, for `_jump` to look at.
+
+    Points are columns of (3, W) from `at` and `other_at` on.
+
+    In single precision and with a hundredth to spare: nearly all pairs are left behind here, many at a time.
+    """
+    limit, half = np.float32(0.99) * steepest2, np.float32(0.5)
+    some = np.uint8(0)
+    x, y, z = ones[0, at:], ones[1, at:], ones[2, at:]
+    u, v, w = others[0, other_at:], others[1, other_at:], others[2, other_at:]
+    for j in range(count):
+        dx, dy, dz = u[j] - x[j], v[j] - y[j], w[j] - z[j]
+        sx, sy, sz = x[j] + half * dx, y[j] + half * dy, z[j] + half * dz
+        dot = dx * sx + dy * sy + dz * sz
+        squares = (dx * dx + dy * dy + dz * dz) * (sx * sx + sy * sy + sz * sz)
+        # dot^2 > limit x (squares - dot^2), without the difference
+        steep = np.uint8(dot * dot * (np.float32(1) + limit) > limit * squares)
+        found[j] = steep
+        some |= steep
+    return bool(some)
 
 
 @kernel
@@ -277,7 +344,7 @@ def _jump(xyz: Map, sigma_z: Map, i: int, j: int, k: int, m: int, steepest: floa
     dot = dx * sx + dy * sy + dz * sz
     across2 = max((dx * dx + dy * dy + dz * dz) * square - dot * dot, 0.0)
     if dot * dot <= steepest * steepest * across2:
-        return False  # nearly all pairs end here, before the square roots
+        return False
     sigma = max(sigma_z[i, j], sigma_z[k, m])
     allowed = noise * sigma if sigma > 0.0 else 0.0
     return bool((abs(dot) - steepest * math.sqrt(across2)) > allowed * math.sqrt(square))

@@ -6,11 +6,21 @@ import json
 import math
 from dataclasses import asdict
 
+import cv2
 import numpy as np
 import pytest
 
 from scanner.errors import ConfigError
-from scanner.filters import FilterSettings, apply_filters, at_depth_edge, noise_factor, parse_box, parse_depth
+from scanner.filters import (
+    NOISE_SIGMAS,
+    FilterSettings,
+    apply_filters,
+    at_depth_edge,
+    noise_factor,
+    parse_box,
+    parse_depth,
+)
+from scanner.fragments import small_fragments
 from scanner.triangulation import triangulate
 
 ONLY_LIMITS = {"edges": False}
@@ -118,6 +128,40 @@ def test_a_map_noisier_than_it_says_is_not_torn_apart(ball):
     sigma = np.full(z.shape, 0.5, np.float32)
     assert noise_factor(xyz[..., 2], sigma) == pytest.approx(6, rel=0.05)
     assert at_depth_edge(xyz, sigma, np.ones(z.shape, np.bool_)).mean() < 0.005
+
+
+def test_edges_are_those_of_plain_numpy(ball):
+    rng = np.random.default_rng(3)
+    z = 700 + 0.3 * rng.normal(size=ball.lit.shape) + 40 * (rng.random(ball.lit.shape) < 0.01)
+    xyz = along_rays(ball, z)
+    there = rng.random(z.shape) < 0.97
+    sigma = np.full(z.shape, 0.3, np.float32)
+    noise = NOISE_SIGMAS * math.sqrt(2) * noise_factor(xyz[..., 2], sigma)
+    expected = np.zeros(z.shape, np.bool_)
+    for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        step = (xyz[other] - xyz[one]).astype(float)
+        sight = xyz[one] + 0.5 * step
+        length = np.linalg.norm(sight, axis=-1)
+        along = (step * sight).sum(axis=-1) / length
+        across = np.sqrt(np.maximum((step * step).sum(axis=-1) - along**2, 0))
+        jump = np.abs(along) - math.tan(math.radians(80)) * across > noise * 0.3
+        jump &= there[one] & there[other]
+        expected[one] |= jump
+        expected[other] |= jump
+    assert expected.sum() > 1000
+    np.testing.assert_array_equal(at_depth_edge(xyz, sigma, there), expected)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.55, 0.9])
+def test_small_fragments_are_those_of_connected_components(share):
+    there = np.random.default_rng(5).random((97, 131)) < share
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(there.astype(np.uint8), connectivity=4)
+    for limit in (1, 2, 9, 60):
+        small = stats[:, cv2.CC_STAT_AREA] < limit
+        small[0] = False
+        falls, count = small_fragments(there, limit)
+        np.testing.assert_array_equal(falls, small[labels])
+        assert count == falls.sum()
 
 
 def test_limits_take_what_lies_outside_and_count_it(ball):
