@@ -119,7 +119,8 @@ def observe_capture(path: Path, name: str, target: Target) -> Observation | Left
             if pattern < len(sequence):
                 decoder.add(pattern, capture.frame(pattern))
         decoded = decoder.finish()
-        white = capture.frame(sequence.white) if sequence.white in capture.records else None
+        at = sequence.white
+        white = None if at is None or at not in capture.records else capture.frame(at)
     except SyncError as error:
         return LeftOut(name, f"frames out of step: {error}", out_of_step=True)
     except ScannerError as error:
