@@ -27,8 +27,8 @@ from scanner.patterns import CameraFormat, GrayPmpPattern, PartSequence, Pattern
 from scanner.patterns.description import Axis
 
 MOST_APART = 0.42
-"""Of a fringe, between the places of phase and code: beyond, the next fringe is nearly as likely. In the middle of cells
-of half a fringe it is a quarter at most."""
+"""Of a fringe, between the places of phase and code: beyond, the next fringe is nearly as likely. Over the cells
+themselves, of half a fringe, it is a quarter at most."""
 
 
 class GrayPmpDecoder:
@@ -67,7 +67,6 @@ class GrayPmpDecoder:
         found = {axis: self._phases(axis) for axis in self._pattern.axes}
         code = self._code(next(iter(found.values())).maps)
         warnings = list(code.warnings)
-        counts = np.zeros(REASONS, np.int64)
         for axis, of_axis in found.items():
             cells = code.rows if axis == "y" else code.columns
             if cells is None:
@@ -88,13 +87,12 @@ class GrayPmpDecoder:
         return self._decoded(found, first, code, counts, tuple(warnings))
 
     def _require_fringes(self) -> None:
-        lost, first = [], 0
+        lost: list[int] = []
         for s in self._pattern.pmp.sets():
             positions = self._sequence.fringes[s.first : s.first + s.shifts]
             missing = [p for p in positions if p not in self._frames]
             if s.shifts - len(missing) < 3:
                 lost += missing
-            first += s.shifts
         if lost:
             raise DecodeError(
                 f"frames {', '.join(map(str, lost))} are missing: a fringe set needs three",

@@ -1,0 +1,50 @@
+"""A rig's response by flat grey levels: shown up and down again, each seen by the rig's own camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from scanner.calibration.grey_levels import LEVELS, LevelResponse, response_of_levels
+from scanner.clock import Clock
+from scanner.devices import ProjectorKind
+from scanner.errors import ConfigError
+from scanner.sequencer.light import fitting_exposure
+from scanner.sequencer.shots import Shots
+from service.config import RigConfig
+from service.scan_setup import open_rig
+
+
+def measure_response(config: RigConfig, clock: Clock, stage: Callable[[str], None]) -> LevelResponse:
+    """Open a rig's devices, show grey levels as they are (no precorrection), and give the devices back.
+
+    Raises:
+        ConfigError: the projector shows one image only.
+        CalibrationError: the levels show no response.
+        DeviceError: a device cannot be opened, or failed.
+    """
+    stage("opening devices")
+    opened = open_rig(config.model_dump(mode="json"), clock)
+    try:
+        rig = opened.rig
+        capabilities = rig.projector.capabilities
+        if capabilities.kind is not ProjectorKind.FRAMEBUFFER:
+            raise ConfigError(
+                f"a {capabilities.kind.value} projector is not flipped by the host, and shows no levels one by one",
+                device=rig.projector.name,
+                hint="show them by other means, and give the images: fringed calibrate response FOLDER --levels ...",
+            )
+        with Shots(
+            rig.projector, rig.camera, clock, settings=rig.settings, trigger_mode=rig.trigger_mode
+        ) as shots:  # fmt: skip
+            stage("choosing the exposure")
+            fitting_exposure(shots, capabilities.refresh_ns)
+            rig.projector.load([np.full((capabilities.height, capabilities.width), v, np.uint8) for v in LEVELS])
+            shots.images = len(LEVELS)
+            stage("measuring levels")
+            order = [*range(len(LEVELS)), *reversed(range(len(LEVELS)))]
+            frames = [shots.steady(i).pixels for i in order]
+        return response_of_levels([LEVELS[i] for i in order], frames, rig.camera.capabilities.max_value)
+    finally:
+        opened.close()
