@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from scanner.decode.strips import in_strips, threads_to_use
 from scanner.kernel import contracting_kernel
-from scanner.scan import Map, Scan, spread
+from scanner.scan import Map, Scan
+from scanner.scan_report import spread
 
 BLUR_VARIANCE_PX2 = 0.5
 """Of a lens in focus: a spread of .7 camera pixels, a quarter of a pixel wider than the pixel itself."""

@@ -6,20 +6,16 @@ formats.md (scan.npz, cloud.ply, preview.png, report.json). Pictures are drawn i
 
 from __future__ import annotations
 
-import json
-import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,15 +27,13 @@ from scanner.normals import normals_of
 from scanner.npz import read_npz, write_npz
 from scanner.ply import vertices_of, write_ply
 from scanner.preview import preview_picture
+from scanner.scan_report import read_report, report_of, share
 from scanner.storage import replace_file, replace_json, replacing, storage_errors
 from scanner.triangulation import triangulate
 
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.uint8]
-
-FORMAT = "fringed-report"
-VERSION = 1
 
 Progress = Callable[[str], None]
 """Told the name of each file as it is written whole."""
@@ -111,7 +105,7 @@ class Scan:
     @property
     def coverage(self) -> float:
         """Share of lit pixels with a decoded value; 0 if nothing is lit."""
-        return _share(np.count_nonzero(self.decoded), np.count_nonzero(self.lit))
+        return share(np.count_nonzero(self.decoded), np.count_nonzero(self.lit))
 
     def with_report(self, **members: Any) -> Scan:
         """The same scan with more in its report."""
@@ -213,7 +207,7 @@ def build_scan(
     )
     with _timed(timings, "normals"):
         _ = scan.normals
-    return _with_same_normals(scan, _report(scan, decoded, calibration, settings, removed, timings))
+    return _with_same_normals(scan, report_of(scan, decoded, calibration, settings, removed, timings))
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,71 +278,7 @@ def load_scan(folder: Path) -> Scan:
             raise StorageError(f"{path}: {name} has shape {array.shape}, expected {expected}")
     for name in ("rows", "columns", "sigma_rows", "sigma_columns"):
         arrays.setdefault(name, None)  # type: ignore[arg-type]
-    return Scan(**arrays, report=_read_report(folder / "report.json"))
-
-
-def _read_report(path: Path) -> dict[str, Any]:
-    try:
-        report = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError) as error:
-        raise StorageError(f"cannot read {path}: {error}") from error
-    if not isinstance(report, dict) or report.get("format") != FORMAT or report.get("version") != VERSION:
-        raise StorageError(f"{path} is no version {VERSION} of {FORMAT}", hint="update fringed, or remove the file")
-    return report
-
-
-def _report(
-    scan: Scan,
-    decoded: Decoded,
-    calibration: Calibration | None,
-    settings: FilterSettings,
-    removed: Mapping[str, int],
-    timings: Mapping[str, float],
-) -> dict[str, Any]:
-    pixels, lit, values = scan.reason.size, np.count_nonzero(scan.lit), np.count_nonzero(scan.decoded)
-    points = 0 if scan.xyz is None else np.count_nonzero(scan.valid)
-    report: dict[str, Any] = {
-        "format": FORMAT,
-        "version": VERSION,
-        "points": int(points),
-        "counts": {"pixels": int(pixels), "lit": int(lit), "decoded": int(values), "reasons": _reasons(scan.reason)},
-        "coverage": {
-            "image": _share(values, pixels),
-            "lit": _share(values, lit),
-            "points_of_lit": _share(points, lit),
-        },
-        "removed": dict(removed),
-        "filters": settings.as_dict(),
-        "rows_px": spread(scan.rows),
-        "columns_px": spread(scan.columns),
-        "sigma_rows_px": spread(scan.sigma_rows),
-        "sigma_columns_px": spread(scan.sigma_columns),
-        "depth_mm": spread(None if scan.xyz is None else scan.xyz[..., 2]),
-        "sigma_z_mm": spread(scan.sigma_z),
-        "rig": None if calibration is None else _rig(calibration),
-        "decoder": dict(decoded.details),
-        "warnings": list(decoded.warnings),
-        "timings": dict(timings),
-        "versions": versions(),
-    }
-    return report
-
-
-def versions() -> dict[str, str]:
-    """What made the scan: fringed, Python and the libraries whose numbers could differ."""
-    try:
-        own = metadata.version("fringed")
-    except metadata.PackageNotFoundError:
-        own = "not installed"
-    return {
-        "fringed": own,
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "opencv": cv2.__version__,
-        "numba": numba.__version__,
-    }
+    return Scan(**arrays, report=read_report(folder / "report.json"))
 
 
 def _with_same_normals(scan: Scan, report: Mapping[str, Any]) -> Scan:
@@ -358,35 +288,11 @@ def _with_same_normals(scan: Scan, report: Mapping[str, Any]) -> Scan:
     return made
 
 
-def _reasons(reason: NDArray[np.uint8]) -> dict[str, int]:
-    return {kind.name.lower(): int(np.count_nonzero(reason == kind)) for kind in Reason}
-
-
 def _among(kinds: tuple[Reason, ...]) -> Mask:
     """(256,) bool, to look reasons up in."""
     table = np.zeros(256, np.bool_)
     table[list(kinds)] = True
     return table
-
-
-def _rig(calibration: Calibration) -> dict[str, Any]:
-    return {"calibration": calibration.id, "projector_centre_mm": calibration.projector_centre.tolist()}
-
-
-def spread(values: Map | None) -> dict[str, float] | None:
-    """1st, 50th and 99th percentile of a map, from every fourth pixel each way where it is large."""
-    if values is None:
-        return None
-    sample = values[::4, ::4] if values.size > 100_000 else values
-    sample = sample[np.isfinite(sample)]
-    if sample.size == 0:
-        return None
-    low, median, high = np.percentile(sample, (1, 50, 99))
-    return {"p1": float(low), "median": float(median), "p99": float(high)}
-
-
-def _share(part: int | np.intp, whole: int | np.intp) -> float:
-    return float(part) / float(whole) if whole else 0.0
 
 
 def _png(picture: Picture) -> bytes:

@@ -1,0 +1,123 @@
+"""report.json: what a scan says of itself in figures, and which programs made it (formats.md, Scan)."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode import Decoded, Reason
+from scanner.errors import StorageError
+from scanner.filters import FilterSettings
+from scanner.geometry import Calibration
+
+if TYPE_CHECKING:
+    from scanner.scan import Scan
+
+Map = NDArray[np.float32]
+
+FORMAT = "fringed-report"
+VERSION = 1
+
+
+def report_of(
+    scan: Scan,
+    decoded: Decoded,
+    calibration: Calibration | None,
+    settings: FilterSettings,
+    removed: Mapping[str, int],
+    timings: Mapping[str, float],
+) -> dict[str, Any]:
+    """The report of a scan just built, as plain data; `removed`: points by filter, `timings`: seconds by stage."""
+    pixels, lit, values = scan.reason.size, np.count_nonzero(scan.lit), np.count_nonzero(scan.decoded)
+    points = 0 if scan.xyz is None else np.count_nonzero(scan.valid)
+    report: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "points": int(points),
+        "counts": {"pixels": int(pixels), "lit": int(lit), "decoded": int(values), "reasons": _reasons(scan.reason)},
+        "coverage": {
+            "image": share(values, pixels),
+            "lit": share(values, lit),
+            "points_of_lit": share(points, lit),
+        },
+        "removed": dict(removed),
+        "filters": settings.as_dict(),
+        "rows_px": spread(scan.rows),
+        "columns_px": spread(scan.columns),
+        "sigma_rows_px": spread(scan.sigma_rows),
+        "sigma_columns_px": spread(scan.sigma_columns),
+        "depth_mm": spread(None if scan.xyz is None else scan.xyz[..., 2]),
+        "sigma_z_mm": spread(scan.sigma_z),
+        "rig": None if calibration is None else _rig(calibration),
+        "decoder": dict(decoded.details),
+        "warnings": list(decoded.warnings),
+        "timings": dict(timings),
+        "versions": versions(),
+    }
+    return report
+
+
+def read_report(path: Path) -> dict[str, Any]:
+    """report.json; empty where there is none.
+
+    Raises:
+        StorageError: unreadable, or of another format or version.
+    """
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise StorageError(f"cannot read {path}: {error}") from error
+    if not isinstance(report, dict) or report.get("format") != FORMAT or report.get("version") != VERSION:
+        raise StorageError(f"{path} is no version {VERSION} of {FORMAT}", hint="update fringed, or remove the file")
+    return report
+
+
+def versions() -> dict[str, str]:
+    """What made the scan: fringed, Python and the libraries whose numbers could differ."""
+    try:
+        own = metadata.version("fringed")
+    except metadata.PackageNotFoundError:
+        own = "not installed"
+    return {
+        "fringed": own,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "opencv": cv2.__version__,
+        "numba": numba.__version__,
+    }
+
+
+def spread(values: Map | None) -> dict[str, float] | None:
+    """1st, 50th and 99th percentile of a map, from every fourth pixel each way where it is large."""
+    if values is None:
+        return None
+    sample = values[::4, ::4] if values.size > 100_000 else values
+    sample = sample[np.isfinite(sample)]
+    if sample.size == 0:
+        return None
+    low, median, high = np.percentile(sample, (1, 50, 99))
+    return {"p1": float(low), "median": float(median), "p99": float(high)}
+
+
+def share(part: int | np.intp, whole: int | np.intp) -> float:
+    """part / whole, 0 of nothing."""
+    return float(part) / float(whole) if whole else 0.0
+
+
+def _reasons(reason: NDArray[np.uint8]) -> dict[str, int]:
+    return {kind.name.lower(): int(np.count_nonzero(reason == kind)) for kind in Reason}
+
+
+def _rig(calibration: Calibration) -> dict[str, Any]:
+    return {"calibration": calibration.id, "projector_centre_mm": calibration.projector_centre.tolist()}
