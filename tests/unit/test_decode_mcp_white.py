@@ -7,7 +7,7 @@ import pytest
 import typer
 
 from scanner.decode import decoder_for
-from scanner.decode.mcp import white
+from scanner.decode.mcp import linking, stripes, subpixel, white
 from scanner.errors import DecodeError
 from scanner.patterns import PatternSequence
 from service.commands.options import Method, PatternOptions
@@ -91,3 +91,17 @@ def test_the_option_is_for_mcp_alone():
     assert PatternOptions(white=True).members(Method.MCP) == {"white": True}
     with pytest.raises(typer.BadParameter, match="--white"):
         PatternOptions(white=True).members(Method.PMP)
+
+
+def test_without_a_slope_of_brightness_the_fit_is_steadier():
+    line = 20 + 80 * (1 - np.abs(2 * ((np.arange(400) - 7.25) / 40 % 1) - 1))
+    noisy = np.float32(line + np.random.default_rng(3).normal(0, 4, (60, 400)))
+    peaks = stripes.find_peaks(noisy, 40.0, 16.0, 4.0)
+    chains = linking.link(peaks, 40.0)
+    label = np.where((peaks.y > 20) & (peaks.y < 390), np.rint((peaks.y - 27.25) / 40), -1).astype(np.int32)
+    error = {}
+    for even in (False, True):
+        fine = subpixel.refine(noisy, peaks, chains, label, 40.0, even=even)
+        error[even] = np.std((fine.y - 27.25 - 40 * label)[label >= 0])
+    assert error[True] < 0.08
+    assert error[True] < 0.85 * error[False]

@@ -93,7 +93,7 @@ def decide(found: Found, model: PatternModel, clock: Stages) -> Decision:
     with clock.stage("agreement"):
         agrees = description.agreement(here, evidence, model, modulation, path, (sites.start, gap))
     with clock.stage("sub-pixel"):
-        fine = subpixel.refine(found.reduced, peaks, chains, label, found.pitch)
+        fine = subpixel.refine(found.reduced, peaks, chains, label, found.pitch, even=model.even)
     figures = {
         "pitch_px": round(found.pitch, 3),
         "pitch_match": round(found.match, 3),

@@ -52,12 +52,15 @@ def decode_next(
     projector: ProjectorSize,
     camera: CameraFormat,
     known: Known | None,
+    *,
+    even: bool = False,
 ) -> tuple[Decoded, Known]:
     """Decode one image of a series.
 
     Args:
         image, pattern, projector, camera: as for `decode_image`.
         known: what the frame before taught; None, or where it does not hold any more: everything is searched anew.
+        even: a white frame has taken print and shading out of `image`.
 
     Returns:
         the maps, and what the next frame may use.
@@ -65,7 +68,7 @@ def decode_next(
     Raises:
         DecodeError: as `decode_image`.
     """
-    seen, learnt = _see(image, pattern, projector, camera, known)
+    seen, learnt = _see(image, pattern, projector, camera, known, even=even)
     decoded = maps_of(seen.image, seen.found, seen.decided, seen.model, seen.clock)
     decoded = upside_down(decoded) if seen.upside_down else decoded
     return decoded if pattern.axis == "y" else turned_back(decoded), learnt
@@ -78,17 +81,19 @@ def positions_next(
     camera: CameraFormat,
     known: Known | None,
     memory: Array | None = None,
+    *,
+    even: bool = False,
 ) -> tuple[Array, Known]:
     """`decode_next` for those who want rows (axis "x": columns) and no other map: (H, W) float32, NaN where undecided.
 
     Args:
-        image, pattern, projector, camera, known: as for `decode_next`.
+        image, pattern, projector, camera, known, even: as for `decode_next`.
         memory: float32, as large as the image, for the result to be in: fresh memory takes longer than what is written.
 
     Raises:
         DecodeError: as `decode_image`.
     """
-    seen, learnt = _see(image, pattern, projector, camera, known)
+    seen, learnt = _see(image, pattern, projector, camera, known, even=even)
     rows = (np.empty(image.size, np.float32) if memory is None else memory).reshape(seen.image.shape)
     fill_rows(seen.found, seen.decided, seen.model, rows)
     rows = np.ascontiguousarray(rows[::-1]) if seen.upside_down else rows
@@ -108,11 +113,17 @@ class _Seen:
 
 
 def _see(
-    image: NDArray[Any], pattern: McpPattern, projector: ProjectorSize, camera: CameraFormat, known: Known | None
+    image: NDArray[Any],
+    pattern: McpPattern,
+    projector: ProjectorSize,
+    camera: CameraFormat,
+    known: Known | None,
+    *,
+    even: bool,
 ) -> tuple[_Seen, Known]:
     pattern.validate(projector)
     upright = upright_image(image, pattern, camera)
-    model = PatternModel.of(pattern, projector)
+    model = PatternModel.of(pattern, projector, even=even)
     seen = None if known is None else _by_what_is_known(upright, model, camera, known)
     if seen is not None and known is not None:
         return seen, known
@@ -221,7 +232,8 @@ class McpDecoder:
         """The maps; see `scanner.decode.Decoder`."""
         known, self._known = self._known, None  # a frame that is refused teaches nothing
         image, camera = self._to_decode()
-        decoded, self._known = decode_next(image, self._pattern, self._sequence.projector, camera, known)
+        two, size = self._white is not None, self._sequence.projector
+        decoded, self._known = decode_next(image, self._pattern, size, camera, known, even=two)
         if self._white is None:
             return decoded
         white = grey(self._white, self._camera)
@@ -239,8 +251,8 @@ class McpDecoder:
         image, camera = self._to_decode()
         if self._memory.size != image.size:
             self._memory = np.empty(image.size, np.float32)
-        size = self._sequence.projector
-        rows, self._known = positions_next(image, self._pattern, size, camera, known, self._memory)
+        two, size = self._white is not None, self._sequence.projector
+        rows, self._known = positions_next(image, self._pattern, size, camera, known, self._memory, even=two)
         return rows
 
     def _to_decode(self) -> tuple[NDArray[Any], CameraFormat]:

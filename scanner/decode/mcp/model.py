@@ -25,6 +25,7 @@ class PatternModel:
     level: (S,) float32, the stripe's mean light; 0 for a stripe without light.
     carriers: (N,) float32, cycles per projector pixel.
     pitch: height of a stripe, projector px.
+    even: the image shows it without print and shading, which a second frame has taken out.
     """
 
     ratio: Array
@@ -32,9 +33,10 @@ class PatternModel:
     carriers: Array
     pitch: float
     profile: str
+    even: bool = False
 
     @classmethod
-    def of(cls, pattern: McpPattern, projector: ProjectorSize) -> PatternModel:
+    def of(cls, pattern: McpPattern, projector: ProjectorSize, *, even: bool = False) -> PatternModel:
         """The tables of `pattern` as shown by `projector`."""
         count, channels = pattern.stripe_count, pattern.bits
         ratio = np.zeros((count, channels), np.float32)
@@ -52,7 +54,7 @@ class PatternModel:
                 ratio[stripe] = on * amplitude / level[stripe]
         across = projector.along("x" if pattern.axis == "y" else "y")
         carriers = np.asarray(pattern.carriers, np.float32) / np.float32(across)
-        return cls(ratio, level, carriers, pattern.pitch_px(projector), pattern.profile)
+        return cls(ratio, level, carriers, pattern.pitch_px(projector), pattern.profile, even)
 
     @property
     def stripes(self) -> int:

@@ -77,7 +77,7 @@ class Fine:
     whole: NDArray[np.uint8]
 
 
-def refine(reduced: Array, peaks: Peaks, chains: Chains, label: Ints, pitch: float) -> Fine:
+def refine(reduced: Array, peaks: Peaks, chains: Chains, label: Ints, pitch: float, *, even: bool = False) -> Fine:
     """Sub-pixel positions of the peaks that have a label.
 
     Args:
@@ -86,6 +86,7 @@ def refine(reduced: Array, peaks: Peaks, chains: Chains, label: Ints, pitch: flo
         chains: their chains.
         label: (P,) int32, decoded stripe, -1 for none; averaging stops where it changes along a chain.
         pitch: mean pitch, px.
+        even: brightness has no slope, as after a division by a white frame: none is fitted.
     """
     runs, ends = _runs(chains.order, chains.start, label)
     guess = _smoothed(peaks.y, runs, ends)
@@ -96,7 +97,7 @@ def refine(reduced: Array, peaks: Peaks, chains: Chains, label: Ints, pitch: flo
     y, sigma, whole = peaks.y.copy(), np.full(count, np.float32(0.5)), np.zeros(count, np.uint8)
     bend = _bends(guess, peaks.start, label, np.float32(pitch))
     sides = (peaks.y, peaks.above, peaks.below, peaks.valley, peaks.height)
-    _refine(reduced, guess, led, *sides, bend, chains.column, runs, ends, reach, y, sigma, whole)
+    _refine(reduced, guess, led, *sides, bend, chains.column, runs, ends, reach, even, y, sigma, whole)
     return Fine(y, sigma, whole)
 
 
@@ -275,6 +276,7 @@ def _refine(
     runs: Ints,
     ends: Ints,
     reach: int,
+    even: bool,
     y: Array,
     sigma: Array,
     whole: NDArray[np.uint8],
@@ -308,7 +310,7 @@ def _refine(
                 if led[k] and 0 <= guess[k] <= reduced.shape[1] - 1:
                     y[k], whole[k] = guess[k], 1  # its sigma stays
                 continue
-            slope = _slope_at(p, count, kappa, worth)
+            slope = np.float32(0) if even else _slope_at(p, count, kappa, worth)
             shift = (os - slope * sv) / ss
             left = (
                 oo - 2 * shift * os - 2 * slope * ov + shift * shift * ss + 2 * shift * slope * sv + slope * slope * vv
