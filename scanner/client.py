@@ -23,7 +23,7 @@ import zmq.asyncio
 
 from scanner.client_asyncio import AsyncClient
 from scanner.client_sockets import WELCOME_S, configured, conflated, loaded, probe, send, single
-from scanner.errors import ScannerError
+from scanner.errors import ScannerError, Unreachable
 from scanner.session import (
     QUIET_S,
     RESEND_S,
@@ -111,19 +111,31 @@ class Client:
         self._subscribe()
         return str(self._run(single(start_call(method, job_id, params)))["id"])
 
-    def events(self, job_id: str) -> Iterator[Event]:
-        """A job's events until it is over; where some were lost, one that holds the state stands for them."""
+    def events(self, job_id: str, *, patience_s: float | None = None) -> Iterator[Event]:
+        """A job's events until it is over; where some were lost, one that holds the state stands for them.
+
+        Raises:
+            Unreachable: the daemon does not answer, or has had no news of the job for `patience_s`.
+        """
         self._subscribe()
         watch = JobWatch(job_id)
+        heard = time.monotonic()
         while not watch.finished:
             if watch.needs_state:
-                yield from watch.state(self.call("scan.status", id=job_id))
+                news = watch.state(self.call("scan.status", id=job_id))
             else:
-                yield from watch.event(self._next_event(QUIET_S))
+                news = watch.event(self._next_event(QUIET_S))
+            if news:
+                heard = time.monotonic()
+            elif patience_s is not None and time.monotonic() - heard > patience_s:
+                raise Unreachable(
+                    f"no news of scan {job_id} for {patience_s:g} s", hint="fringed status shows what the daemon is at"
+                )
+            yield from news
 
-    def wait(self, job_id: str, on_event: OnEvent | None = None) -> dict[str, Any]:
-        """Wait until a job is over: {id, state, reason, report, files, error}."""
-        for event in self.events(job_id):
+    def wait(self, job_id: str, on_event: OnEvent | None = None, *, patience_s: float | None = None) -> dict[str, Any]:
+        """Wait until a job is over: {id, state, reason, report, files, error}. See `events`."""
+        for event in self.events(job_id, patience_s=patience_s):
             if on_event is not None:
                 on_event(event)
         return self.result(job_id)

@@ -28,7 +28,7 @@ from scanner.calibration.targets import Target
 from scanner.capture import Capture
 from scanner.client import Client
 from scanner.client_sockets import conflated
-from scanner.errors import CalibrationError, DecodeError, SyncError
+from scanner.errors import CalibrationError, DecodeError, SyncError, Unreachable
 from scanner.session import raise_unless_done
 from scanner.wire import Event
 from scanner.wire_images import decode_preview
@@ -40,6 +40,10 @@ PREVIEW_WIDTH = 2048
 """The widest the daemon sends: corners are looked for in the camera's own pixels wherever that goes."""
 LATE_S = 10.0
 """Without a picture for so long the daemon is asked for them again."""
+
+PATIENCE_S = 120.0
+"""Without news of a capture for so long it is given up: four times the silence after which the daemon itself gives its
+devices up."""
 
 OnEvent = Callable[[Event], None]
 
@@ -93,8 +97,8 @@ class GuidedCalibration:
         try:
             job = self._client.start_scan("pmp", pattern={"axes": ["x", "y"]})
             try:
-                raise_unless_done(self._client.wait(job, on_event))
-            except (KeyboardInterrupt, SystemExit):
+                raise_unless_done(self._client.wait(job, on_event, patience_s=PATIENCE_S))
+            except (KeyboardInterrupt, SystemExit, Unreachable):
                 self._client.cancel(job)
                 raise
             self._client.fetch(job, incoming)

@@ -5,14 +5,18 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from scanner import client as client_module
 from scanner.calibration.guide import Guide, Seen
 from scanner.calibration.sight import Sight, Standing
 from scanner.calibration.targets import parse_target
+from scanner.client import Client
+from scanner.errors import Unreachable
 from service.commands import calibrate_run
 from service.keys import Keys, keys
 from service.rig_file_edit import set_values
@@ -149,3 +153,24 @@ def test_a_simulated_target_walks_once_a_sequence_was_shown(walk: str, moves: bo
             bench.greys(255)
             assert (world.view is not before) == moves
             before = world.view
+
+
+def test_a_capture_of_which_nothing_is_heard_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A daemon that answers and has no news, for ever."""
+    client = Client.__new__(Client)
+    now = iter(float(second) for second in range(1000))
+    asked: list[str] = []
+
+    def answer(method: str, **_: Any) -> dict[str, Any]:
+        asked.append(method)
+        return {"number": len(asked), "state": "decoding"}
+
+    monkeypatch.setattr(client_module, "time", SimpleNamespace(monotonic=lambda: next(now)))
+    monkeypatch.setattr(client, "_subscribe", lambda: None)
+    monkeypatch.setattr(client, "_next_event", lambda _: None)
+    monkeypatch.setattr(client, "call", answer)
+    heard: list[str] = []
+    with pytest.raises(Unreachable, match="no news of scan one for 20 s"):
+        client.wait("one", lambda event: heard.append(event.kind), patience_s=20.0)
+    assert heard == ["decoding"]
+    assert len(asked) > 3
