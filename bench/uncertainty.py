@@ -1,15 +1,19 @@
 """How honest the stated uncertainty is: shares of points whose error is within k of their stated sigmas.
 
     python bench/uncertainty.py coverage [--rigs casey2011,bench2026] [--seeds 1] [--frequencies 1,8,64] [--shifts 8]
-    python bench/uncertainty.py response [--seeds 1]
+    python bench/uncertainty.py response [--rigs casey2011] [--seeds 1]
 
 `coverage`: a row a class of points. board, bust: 7 px and more from edges of depth or shadow; edges: points of the bust
 that the filters left within 7 px of one; dark: the board at a tenth of the light; gamma: projected with an exponent off
-by .1; defocus: projector blur of 3 px; textured: a board of print and checkers, albedo .05 to .9; blocks: boxes, without
+by .1; defocus: projector blur of 3 px; textured: a board of print and checkers, albedo .05 to .9; blocks: boxes without
 their edges. Of each, in per cent: `k=1`, `k=2`, error against truth within 1 and 2 stated sigmas; `rnd1`, `rnd2`, the
 same of the difference of two scans that differ in nothing but noise, over sqrt 2, in which what is systematic cancels;
 then the median sigma and the error's rms in mm. An honest sigma has 68.3 and 95.4; asked for are 60-76 and 92-98. The
 worst of all seeds (farthest from 68.3) is shown.
+
+`response`: the board by three shifts, projected with an exponent off by .3 either way: depth rms in mm as it is; with
+`fringed decode --correct-ripple`; projected again with the gamma that the capture's own harmonics tell, and with the
+one that flat grey levels tell; and with the right one. The worst of all seeds and of both ways.
 """
 
 from __future__ import annotations
@@ -20,6 +24,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.registry import open_camera, open_projector
+from scanner.calibration.grey_levels import LEVELS, response_of_levels
+from scanner.calibration.response import response_of_frames
 from scanner.clock import VirtualClock
 from scanner.compare import inside
 from scanner.contrast import widen_at_edges
@@ -27,6 +33,7 @@ from scanner.decode import decoder_for
 from scanner.devices import CameraSettings, TriggerMode
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
 from scanner.patterns.sequence import Precorrection
+from scanner.ripple_correction import without_ripple
 from scanner.scan import build_scan
 
 RIGHT_GAMMA = 2.3
@@ -63,6 +70,10 @@ class Taken:
     scan: object
     truth: object
     decoded: object
+    calibration: object
+    sequence: object
+    camera: object
+    frames: list
 
 
 def take(rig, kind, pattern, seed):
@@ -73,7 +84,8 @@ def take(rig, kind, pattern, seed):
     cap = camera.capabilities
     size = ProjectorSize(projector.capabilities.width, projector.capabilities.height)
     sequence = PatternSequence(size, pattern, precorrection=Precorrection(gamma=kind.gamma))
-    decoder = decoder_for(sequence, CameraFormat(cap.width, cap.height, cap.bits))
+    camera_format, frames = CameraFormat(cap.width, cap.height, cap.bits), []
+    decoder = decoder_for(sequence, camera_format)
     camera.apply(CameraSettings(exposure_ns=33_333_333))
     projector.load([sequence.image(k) for k in range(len(sequence))])
     camera.start(TriggerMode.SOFTWARE)
@@ -81,11 +93,13 @@ def take(rig, kind, pattern, seed):
         projector.show(position)
         clock.sleep_until(clock.now_ns() + 100_000_000)
         camera.trigger()
-        decoder.add(position, camera.pop(1_000_000_000).pixels)
+        frames.append(camera.pop(1_000_000_000).pixels.copy())
+        decoder.add(position, frames[-1])
     decoded, truth, calibration = decoder.finish(), camera.truth(), camera.true_calibration()
     camera.close()
     projector.close()
-    return Taken(widen_at_edges(build_scan(decoded, calibration), calibration.phase_axis), truth, decoded)
+    scan = widen_at_edges(build_scan(decoded, calibration), calibration.phase_axis)
+    return Taken(scan, truth, decoded, calibration, sequence, camera_format, frames)
 
 
 def coverage(kind, one, other):
@@ -121,16 +135,68 @@ def print_coverage(chosen):
             print(f"| {kind.name} | " + " | ".join(cells) + " |", flush=True)
 
 
+def depth_rms(taken, decoded=None):
+    """Inside, mm."""
+    scan = taken.scan if decoded is None else build_scan(decoded, taken.calibration)
+    error = (scan.xyz[..., 2] - taken.truth.xyz[..., 2])[inside(taken.truth)]
+    return float(np.sqrt(np.nanmean(error**2)))
+
+
+def gamma_of_levels(rig, seed):
+    """What flat grey levels tell of the projector."""
+    clock = VirtualClock()
+    device = f"{rig}/board?seed={seed}"
+    camera, projector = (open_("simulated", device, {}, clock) for open_ in (open_camera, open_projector))
+    cap, size = camera.capabilities, projector.capabilities
+    camera.apply(CameraSettings(exposure_ns=33_333_333))
+    projector.load([np.full((size.height, size.width), v, np.uint8) for v in LEVELS])
+    camera.start(TriggerMode.SOFTWARE)
+    frames = []
+    for i in range(len(LEVELS)):
+        projector.show(i)
+        clock.sleep_until(clock.now_ns() + 100_000_000)
+        camera.trigger()
+        frames.append(camera.pop(1_000_000_000).pixels.copy())
+    camera.close()
+    projector.close()
+    return response_of_levels(LEVELS, frames, (1 << cap.bits) - 1).gamma
+
+
+def print_response(chosen):
+    print("| rig | pattern | as it is | --correct-ripple | by harmonics | by grey levels | right gamma |")
+    print("|---|---|" + "---:|" * 5)
+    for rig in chosen.rigs.split(","):
+        axis = "x" if rig == "bench2026" else "y"
+        for frequencies in ((1.0, 8.0, 32.0), (1.0, 8.0, 64.0)):
+            pattern = PmpPattern((axis,), frequencies, (3, 3, 3))
+            rows = []
+            for seed in range(chosen.seeds):
+                levels = depth_rms(take(rig, Class("", "board", gamma=gamma_of_levels(rig, seed)), pattern, seed + 100))
+                right = depth_rms(take(rig, Class("", "board"), pattern, seed + 100))
+                for off in (-0.3, 0.3):
+                    wrong = take(rig, Class("", "board", gamma=RIGHT_GAMMA + off), pattern, seed)
+                    straight = without_ripple(wrong.decoded, wrong.sequence)
+                    told = response_of_frames(wrong.sequence, wrong.camera, wrong.frames).gamma
+                    again = take(rig, Class("", "board", gamma=told), pattern, seed + 100)
+                    rows.append([depth_rms(wrong), depth_rms(wrong, straight), depth_rms(again), levels, right])
+            worst = np.max(rows, axis=0)
+            name = ",".join(f"{f:g}" for f in frequencies)
+            print(f"| {rig} | ({name}) x 3 | " + " | ".join(f"{v:.3f}" for v in worst) + " |", flush=True)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("coverage",))
+    parser.add_argument("what", choices=("coverage", "response"))
     parser.add_argument("--rigs", default="casey2011,bench2026")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--frequencies", default="1,8,64")
     parser.add_argument("--shifts", type=int, default=8)
     parser.add_argument("--only", default="", help="classes, by name")
     chosen = parser.parse_args()
-    print_coverage(chosen)
+    if chosen.what == "coverage":
+        print_coverage(chosen)
+    else:
+        print_response(chosen)
 
 
 if __name__ == "__main__":

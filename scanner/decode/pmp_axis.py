@@ -167,7 +167,9 @@ def decode_axis(
     remainders = sample.agreement(ladder, noise, centre, least, t.min_modulation_sigmas, t.phase_floor_cycles)
     per_cycle = along / float(ladder.frequencies[-1])
     random_px = per_cycle * sample.phase_sigma(noise, finest, least, t.min_modulation_sigmas)
-    light = judge_ripple(light, sample, ladder, noise, centre, along, least, t.min_modulation_sigmas)
+    light = judge_ripple(
+        light, frames, sample, pixels, t.clip(camera), ladder, noise, centre, along, least, t.min_modulation_sigmas
+    )
     ripple = None
     if remainders and remainders[-1].pixels >= MIN_PIXELS:
         ripple = _ripple(remainders[-1], float((ladder.errors[-1] ** 2).sum()), per_cycle, random_px)

@@ -27,14 +27,11 @@ from scanner.decode.harmonics import (
 )
 from scanner.decode.noise import NoiseModel
 from scanner.decode.pmp_frames import AxisFrames
-from scanner.decode.pmp_sample import PRIOR_FREEDOM, Sample
+from scanner.decode.pmp_sample import PRIOR_FREEDOM, Sample, take_fine_sample
 from scanner.decode.unwrapping import Ladder
 
 THINNED = 8
 """Of the sample's runs, one in so many is asked for overtones: five hundred pixels tell a share to .0005."""
-
-THINNED_RIPPLE = 2
-"""The same for ripples, which are told by remainders alone."""
 
 LEAST_EXPLAINED = 0.02
 """Of the noise's part in the residuals: where overtones add less, the noise model is good to 1 % as it is."""
@@ -103,7 +100,10 @@ def judge_light(
 
 def judge_ripple(
     light: Light,
+    frames: AxisFrames,
     sample: Sample,
+    pixels: int,
+    clip: int,
     ladder: Ladder,
     noise: NoiseModel,
     centre: float,
@@ -111,11 +111,18 @@ def judge_ripple(
     least: float,
     sigmas: float,
 ) -> Light:
-    """The same with the overtones that pass for the fringe; arguments as of `Sample.agreement`."""
+    """The same with the overtones that pass for the fringe.
+
+    A sample of its own is taken for them: what rounding of the projected images does is a function of the phase, too,
+    and only many phases tell the two apart.
+
+    Args:
+        pixels: of a frame. clip: see `take_sample`. The others: see `Sample.agreement`.
+    """
     if all(s.shifts >= FEWEST_SHIFTS_UNHARMED for s in light.harmonics):
         return light
-    good = sample.good(noise, least, sigmas)[::THINNED_RIPPLE]
-    phases = sample.phases[:, ::THINNED_RIPPLE][:, good]
+    fine = replace(take_fine_sample(frames, pixels, sample.max_value, clip), prior=sample.prior)
+    phases = fine.phases[:, fine.good(noise, least, sigmas)]
     shifts = [s.shifts for s in light.harmonics]
     periods = [along / s.frequency for s in light.harmonics]
     found = ripples(ladder, remainders_of(ladder, phases, centre), phases, shifts, periods)

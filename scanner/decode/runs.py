@@ -17,7 +17,12 @@ def runs_of(pixels: int, size: int) -> tuple[NDArray[np.intp], int]:
     One run lies in each of R equal parts of the image, at places that fall into no step with its width; a small image
     is taken whole.
     """
-    length = min(RUN, pixels)
+    return spread_runs(pixels, size, RUN)
+
+
+def spread_runs(pixels: int, size: int, run: int) -> tuple[NDArray[np.intp], int]:
+    """The same with runs of another length: short ones are many, and see more phases of fringes that run along rows."""
+    length = min(run, pixels)
     if size * 2 >= pixels:
         return np.arange(0, pixels - length + 1, length, dtype=np.intp), length
     count = size // length
