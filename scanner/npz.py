@@ -6,7 +6,9 @@ against its header before a byte of it is decoded.
 
 from __future__ import annotations
 
+import io
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -21,17 +23,30 @@ MAX_BYTES = 4 << 30
 
 
 def write_npz(file: BinaryIO, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays as an uncompressed .npz; the same arrays give the same bytes."""
+    """Write arrays as an uncompressed .npz, from front to back; the same arrays give the same bytes."""
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
             solid = np.ascontiguousarray(array)
-            info = zipfile.ZipInfo(f"{name}.npy")  # dated 1980, whatever the clock says
-            info.external_attr = 0o644 << 16
-            info.file_size = solid.nbytes + 1024  # decides whether the member needs 64-bit sizes
-            with archive.open(info, "w") as member:
-                header = np.lib.format.header_data_from_array_1_0(solid)
-                np.lib.format.write_array_header_1_0(member, header)
-                member.write(bytes_of(solid))
+            header = io.BytesIO()
+            np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(solid))
+            _append(archive, file, f"{name}.npy", header.getvalue(), bytes_of(solid))
+
+
+def _append(archive: zipfile.ZipFile, file: BinaryIO, name: str, header: bytes, content: memoryview) -> None:
+    """A member whose checksum stands in its header from the start: zipfile would go back and write it there later."""
+    info = zipfile.ZipInfo(name)  # dated 1980, whatever the clock says
+    info.external_attr = 0o644 << 16
+    info.header_offset = file.tell()
+    info.file_size = info.compress_size = len(header) + len(content)
+    info.CRC = zlib.crc32(content, zlib.crc32(header))
+    file.write(info.FileHeader())
+    file.write(header)
+    file.write(content)
+    archive.filelist.append(info)
+    archive.NameToInfo[name] = info
+    # Where the list of members will be written when the archive is closed.
+    archive.start_dir = file.tell()
+    archive._didModify = True  # type: ignore[attr-defined]
 
 
 def read_npz(path: Path, dtypes: Mapping[str, Any]) -> dict[str, NDArray[Any]]:

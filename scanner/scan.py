@@ -27,7 +27,7 @@ from scanner.normals import normals_of
 from scanner.npz import read_npz, write_npz
 from scanner.ply import vertices_of, write_ply
 from scanner.preview import preview_picture
-from scanner.scan_report import read_report, report_of, share
+from scanner.scan_report import DECODED, NOT_LIT, read_report, report_of, share
 from scanner.storage import replace_file, replace_json, replacing, storage_errors
 from scanner.triangulation import triangulate
 
@@ -40,8 +40,6 @@ Progress = Callable[[str], None]
 
 _MAPS = ("rows", "columns", "sigma_rows", "sigma_columns", "sigma_z", "confidence", "albedo", "modulation")
 _DTYPES = {**dict.fromkeys(_MAPS, "<f4"), "xyz": "<f4", "reason": "u1", "stripes": "<i2", "peaks": "<f4"}
-_NOT_LIT = (Reason.SHADOW, Reason.LOW_MODULATION)
-_DECODED = (Reason.VALUE, Reason.FILTERED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +78,12 @@ class Scan:
     @property
     def decoded(self) -> Mask:
         """(H, W) bool: pixels with a decoded value, whatever the filters did."""
-        return _among(_DECODED)[self.reason]
+        return _among(DECODED)[self.reason]
 
     @property
     def lit(self) -> Mask:
         """(H, W) bool: pixels that the projector's light reached, as far as the decoder could see."""
-        return ~_among(_NOT_LIT)[self.reason]
+        return ~_among(NOT_LIT)[self.reason]
 
     @property
     def points(self) -> Map:
@@ -111,11 +109,16 @@ class Scan:
         """The same scan with more in its report."""
         return replace(self, report={**self.report, **members})
 
-    def save(self, folder: Path, progress: Progress | None = None) -> tuple[str, ...]:
+    def save(
+        self, folder: Path, progress: Progress | None = None, digests: dict[str, str] | None = None
+    ) -> tuple[str, ...]:
         """Write the folder: scan.npz, cloud.ply, preview.png, (error_map.png,) report.json, each whole, in this order.
 
         report.json is last: a folder that has it is complete. Files of an earlier scan are removed first. A cloud
         without points gets no cloud.ply, and a warning in the report.
+
+        Args:
+            progress: told each file when it is whole. digests: takes its SHA-256 before that, by its name.
 
         Returns:
             Names of the files written, in order.
@@ -139,14 +142,14 @@ class Scan:
             if progress is not None:
                 progress(name)
 
-        # The picture is drawn while the arrays go to the disk; both need the normals, which are made once.
-        normals = self.normals
+        # The arrays first: who waits for points has them before anything is drawn.
+        with file("scan.npz") as path, replacing(path, digests) as npz:
+            write_npz(npz, self.arrays())
         with ThreadPoolExecutor(1, thread_name_prefix="preview") as drawing:
             picture = drawing.submit(lambda: _png(preview_picture(self)))
-            with file("scan.npz") as path, replacing(path) as npz:
-                write_npz(npz, self.arrays())
+            normals = self.normals
             if self.xyz is not None and normals is not None and self.valid.any():
-                with file("cloud.ply") as path, replacing(path) as ply:
+                with file("cloud.ply") as path, replacing(path, digests) as ply:
                     vertices = vertices_of(self.xyz, normals, self.albedo, self.confidence)
                     write_ply(ply, vertices, ("fringed; mm, camera frame: x right, y down, z forward",))
             elif self.xyz is not None:
@@ -157,12 +160,12 @@ class Scan:
                     "name one with --calibration, or in the rig file"
                 )
             with file("preview.png") as path:
-                replace_file(path, picture.result())
+                replace_file(path, picture.result(), digests)
         if self.error_map is not None:
             with file("error_map.png") as path:
-                replace_file(path, _png(self.error_map))
+                replace_file(path, _png(self.error_map), digests)
         with file("report.json") as path:
-            replace_json(path, {**self.report, "timings": timings, "warnings": warnings})
+            replace_json(path, {**self.report, "timings": timings, "warnings": warnings}, digests)
         return tuple(written)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -205,9 +208,7 @@ def build_scan(
         stripes=decoded.stripes,
         peaks=decoded.peaks,
     )
-    with _timed(timings, "normals"):
-        _ = scan.normals
-    return _with_same_normals(scan, report_of(scan, decoded, calibration, settings, removed, timings))
+    return replace(scan, report=report_of(scan, decoded, calibration, settings, removed, timings))
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,8 +245,9 @@ def filtered_points(
         )
     with _timed(timings, "filter"):
         falls, removed = apply_filters(found.xyz, found.sigma_z, decoded.confidence, settings)
-        found.xyz[falls] = np.nan
-        found.sigma_z[falls] = np.nan
+        fallen = np.flatnonzero(falls)
+        found.xyz.reshape(-1, 3)[fallen] = np.nan
+        found.sigma_z.reshape(-1)[fallen] = np.nan
         reason = decoded.reason.copy()
         reason[(reason == Reason.VALUE) & np.isnan(found.xyz[..., 2])] = Reason.FILTERED
     return FilteredPoints(found.xyz, found.sigma_z, reason, {"impossible": found.impossible, **removed})
@@ -279,13 +281,6 @@ def load_scan(folder: Path) -> Scan:
     for name in ("rows", "columns", "sigma_rows", "sigma_columns"):
         arrays.setdefault(name, None)  # type: ignore[arg-type]
     return Scan(**arrays, report=read_report(folder / "report.json"))
-
-
-def _with_same_normals(scan: Scan, report: Mapping[str, Any]) -> Scan:
-    """The scan with its report; normals that were computed are kept."""
-    made = replace(scan, report=report)
-    made.__dict__["normals"] = scan.normals
-    return made
 
 
 def _among(kinds: tuple[Reason, ...]) -> Mask:

@@ -6,13 +6,16 @@ Also: output folders that are refused unless empty, and room on the disk asked f
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
+import queue
 import shutil
+import threading
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 from scanner.errors import StorageError
 
@@ -26,19 +29,23 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def replace_file(path: Path, content: bytes) -> None:
-    """Write `content` to `path`: a temporary file beside it, fsync, rename, fsync of the folder.
+def replace_file(path: Path, content: bytes, digests: dict[str, str] | None = None) -> None:
+    """Write `content` to `path`: a temporary file beside it, fsync, rename, fsync of the folder. digests: `replacing`.
 
     Raises:
         StorageError: the disk is full, or the folder cannot be written.
     """
-    with replacing(path) as file:
+    with replacing(path, digests) as file:
         file.write(content)
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[BinaryIO]:
+def replacing(path: Path, digests: dict[str, str] | None = None) -> Iterator[BinaryIO]:
     """A file to write; on leaving it takes the place of `path`, as `replace_file` says. Nothing is left on failure.
+
+    Args:
+        digests: takes the SHA-256 of what was written, by the file's name. It is made in another thread while this one
+            writes: from front to back, in buffers that do not change before the end.
 
     Raises:
         StorageError: the disk is full, or the folder cannot be written.
@@ -46,10 +53,13 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     temporary = path.with_name(f".{path.name}.tmp")
     with storage_errors(path):
         try:
-            with temporary.open("wb") as file:
-                yield file
+            with temporary.open("wb") as file, ExitStack() as reading:
+                told = file if digests is None else reading.enter_context(_Digesting(file))
+                yield cast(BinaryIO, told)
                 file.flush()
                 os.fsync(file.fileno())
+            if digests is not None:
+                digests[path.name] = cast(_Digesting, told).hexdigest()
             temporary.replace(path)
         except BaseException:
             temporary.unlink(missing_ok=True)
@@ -57,9 +67,41 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         sync_folder(path.parent)
 
 
-def replace_json(path: Path, content: Any) -> None:
+class _Digesting:
+    """A file that can be written, and a thread that makes the digest of what is."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._sha = hashlib.sha256()
+        self._parts: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._digest, name="digest")
+        self.tell, self.flush = file.tell, file.flush
+
+    def __enter__(self) -> _Digesting:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._parts.put(None)
+        self._thread.join()
+
+    def write(self, part: Any) -> int:
+        """Write bytes that do not change until the file is closed."""
+        self._parts.put(part)
+        return self._file.write(part)
+
+    def hexdigest(self) -> str:
+        """SHA-256 of all that was written, once the file is closed."""
+        return self._sha.hexdigest()
+
+    def _digest(self) -> None:
+        while (part := self._parts.get()) is not None:
+            self._sha.update(part)
+
+
+def replace_json(path: Path, content: Any, digests: dict[str, str] | None = None) -> None:
     """Write plain data as JSON with `replace_file`."""
-    replace_file(path, (json.dumps(content, indent=1) + "\n").encode())
+    replace_file(path, (json.dumps(content, indent=1) + "\n").encode(), digests)
 
 
 def prepare_output(folder: Path, *, force: bool = False) -> Path:

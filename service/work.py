@@ -218,15 +218,16 @@ class _Series:
         output = prepare_output(Path(self._start.output), force=True)
         began = time.perf_counter()
         entries: list[FileEntry] = []
+        digests: dict[str, str] = {}
 
         def written(name: str) -> None:
-            entries.append(file_entry(output, name))
+            entries.append(file_entry(output, name, sha=digests.get(name)))
             if name == "scan.npz":
                 self._answer(DecodedNote(self.delivery, list(entries), _short(scan.report)))
             self._stage(f"wrote {name}")
 
         self._stage("writing files")
-        scan.save(output, written)
+        scan.save(output, written, digests)
         capture = sorted(path.name for path in self._folder.iterdir() if path.is_file() and path.name[0] != ".")
         entries += [file_entry(self._folder, name, f"{CAPTURE}/{name}") for name in capture]
         _log.info("delivery %d: files written in %.2f s", self.delivery, time.perf_counter() - began)
@@ -274,11 +275,12 @@ class _MappedFrames:
         self._map = None
 
 
-def file_entry(folder: Path, name: str, listed_as: str | None = None) -> FileEntry:
-    """A file's name, size and SHA-256, for the list that clients fetch by."""
+def file_entry(folder: Path, name: str, listed_as: str | None = None, sha: str | None = None) -> FileEntry:
+    """A file's name, size and SHA-256 (read from it where it is not known), for the list that clients fetch by."""
     path = folder / name
-    with path.open("rb") as file:
-        sha = hashlib.file_digest(file, "sha256").hexdigest()
+    if sha is None:
+        with path.open("rb") as file:
+            sha = hashlib.file_digest(file, "sha256").hexdigest()
     return FileEntry(listed_as or name, path.stat().st_size, sha)
 
 

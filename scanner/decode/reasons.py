@@ -10,6 +10,26 @@ from scanner.kernel import contracting_kernel
 REASONS = 9
 """Members of `scanner.decode.Reason`."""
 
+_STRETCH = 16384
+
+
+def tally(reason: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """(REASONS,) how many pixels of a map have each reason."""
+    counts = np.zeros(REASONS, np.int64)
+    _count_all(np.ascontiguousarray(reason).reshape(-1), counts)
+    return counts
+
+
+def warm_up() -> None:
+    """Compile the kernels."""
+    tally(np.zeros(4, np.uint8))
+
+
+@contracting_kernel
+def _count_all(reason: NDArray[np.uint8], counts: NDArray[np.int64]) -> None:
+    for begin in range(0, reason.size, _STRETCH):
+        count_reasons(reason[begin : begin + _STRETCH], counts)
+
 
 @contracting_kernel
 def count_reasons(reason: NDArray[np.uint8], counts: NDArray[np.int64]) -> None:
