@@ -111,6 +111,23 @@ def test_a_step_of_depth_is_not_crossed(pattern):
     assert wrong.mean() < 0.03
 
 
+@pytest.mark.parametrize("left", [100, 231, 333])
+def test_an_isolated_strip_narrower_than_two_beats_of_its_carriers_is_read(left):
+    frame, truth = render(OWN)
+    inside = np.zeros(CAMERA.shape, bool)
+    inside[:, left : left + 60] = True
+    dark = np.clip(np.random.default_rng(2).normal(3, 1, CAMERA.shape), 0, 255).astype(np.uint8)
+    decoded = decode_image(np.where(inside, frame, dark), OWN, PROJECTOR, CAMERA)
+    x, y, row, _, _ = decoded.peaks.T
+    at = np.rint(y).astype(int), np.rint(x).astype(int)
+    assert len(row) > 0.85 * 15 * 13
+    assert (np.abs(row - truth[at]) < OWN.pitch_px(PROJECTOR) / 2).mean() > 0.99
+    assert inside[at].mean() > 0.95
+    narrow = np.where(np.arange(CAMERA.width) < left + 20, np.where(inside, frame, dark), dark)
+    with pytest.raises(DecodeError):
+        decode_image(narrow, OWN, PROJECTOR, CAMERA)
+
+
 def test_twelve_bits_give_what_eight_bits_give():
     eight, truth = decode(OWN)
     twelve, _ = decode(OWN, camera=CameraFormat(512, 384, 12))

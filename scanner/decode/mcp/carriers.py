@@ -39,6 +39,9 @@ TILES_Y, TILES_X = 6, 4
 ENOUGH_PIECES = 16
 """Long pieces of stripe that suffice for the search: half a pattern's worth."""
 
+SHORT_STEP = 5
+"""The same times this for short chains, over which two such sets of carriers part by a tenth of a cycle."""
+
 LEAST_LINE = 0.1
 """Share of a spectrum's strongest line that is no line: its skirts fall to that within the window's lobe, and where
 nothing lies between the carriers they would seem to stand out of it."""
@@ -134,6 +137,22 @@ def places(peaks: Peaks, chains: Chains, shape: tuple[int, int]) -> tuple[NDArra
     return x, peaks.y.astype(np.float64) * (2.0 / shape[0]) - 1
 
 
+def are_short(chains: Chains, model: PatternModel, around: float) -> bool:
+    """Whether hardly any chain is two beats of the two nearest carriers long, so that spectra do not part them.
+
+    Args:
+        chains: the chains.
+        model: the pattern's tables.
+        around: magnification expected.
+    """
+    return bool((chains.lengths * (1.5 * STEP) >= _window_px(model, around)).sum() < ENOUGH_PIECES)
+
+
+def _window_px(model: PatternModel, around: float) -> int:
+    """Three beats of the two nearest carriers: what lies between is then outside a Hann window's lobes of both."""
+    return STEP * round(float(np.clip(3 * around / model.separation, 64, 1024)) / STEP)
+
+
 def search_carriers(
     signals: Signals, peaks: Peaks, chains: Chains, model: PatternModel, around: float, shape: tuple[int, int]
 ) -> CarrierSearch:
@@ -147,12 +166,13 @@ def search_carriers(
         around: magnification expected, from the pitch.
         shape: (H, W) of the image.
     """
-    # Three beats of the two nearest carriers: what lies between them is then outside a Hann window's lobes of both.
-    size = STEP * round(float(np.clip(3 * around / model.separation, 64, 1024)) / STEP)
+    size = _window_px(model, around)
     steps = np.arange(-np.log(SCALE_RANGE), np.log(SCALE_RANGE), LOG_STEP)
     scales = around * np.exp(steps)
     # Beyond .45 cycles a pixel neither columns of four pixels nor a blurred lens show a carrier.
     scales = scales[float(model.carriers.max()) / scales <= 0.45]
+    if len(scales) >= 2 and are_short(chains, model, around):
+        return _by_least_squares(signals.light, chains, model, scales[::SHORT_STEP], around, size)
     power, middle = _spectra(signals.light, chains, size)
     if not len(power) or len(scales) < 2:
         return CarrierSearch(around, 0.0, 0.0, (0.0,) * model.channels)
@@ -223,6 +243,39 @@ def _shifted_sum(score: NDArray[np.float64], shift: Ints, total: NDArray[np.floa
             moved = min(max(q + shift[t], 0), size - 1)
             for i in range(channels):
                 total[q, i] += score[t, moved, i]
+
+
+def _by_least_squares(
+    light: Array, chains: Chains, model: PatternModel, scales: NDArray[np.float64], around: float, size: int
+) -> CarrierSearch:
+    """The magnification at which ground and carriers, fitted to each short chain, leave least of it.
+
+    Carriers that lie nearer than a chain resolves are no lines in its spectrum, but of the right set of frequencies all
+    chains are made up. Where any set fits (fewer samples than three for each unknown) nothing is said.
+    """
+    unknowns = 3 + 2 * model.channels
+    lengths = np.minimum(chains.lengths * STEP, size)
+    left = np.zeros(len(scales))
+    for length in np.unique(lengths[lengths >= 3 * unknowns]):
+        begin = STEP * chains.start[:-1][lengths == length]
+        pieces = light[begin[:, None] + np.arange(length)].astype(np.float64)
+        t = np.arange(length) - (length - 1) / 2
+        window = np.sqrt(np.sin(np.pi * (np.arange(length) + 0.5) / length))
+        ground = np.linalg.qr(np.vander(2 * t / length, 3) * window[:, None])[0]
+        pieces *= window / np.maximum(np.abs(pieces.mean(axis=1, keepdims=True)), 1e-6)
+        pieces -= (pieces @ ground) @ ground.T
+        for i, scale in enumerate(scales):
+            phase = 2 * np.pi * t[:, None] * (model.carriers / scale)
+            waves = np.concatenate([np.cos(phase), np.sin(phase)], axis=1) * window[:, None]
+            waves -= ground @ (ground.T @ waves)
+            axes, strength, _ = np.linalg.svd(waves, full_matrices=False)
+            fitted = pieces @ axes[:, strength > 0.1 * strength[0]]
+            left[i] += float((pieces**2).sum() - (fitted**2).sum())
+    if not left.any():
+        return CarrierSearch(around, 0.0, 0.0, (0.0,) * model.channels)
+    # Between like remainders the magnification nearest to what the pitch says.
+    best = int(np.argmin(left / np.median(left) + 0.5 * np.log(scales / around) ** 2))
+    return CarrierSearch(float(scales[best]), 0.0, 0.0, (float(np.median(left) / left[best]),) * model.channels)
 
 
 def _spectra(light: Array, chains: Chains, size: int) -> tuple[NDArray[np.float64], Ints]:

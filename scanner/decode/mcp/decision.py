@@ -89,7 +89,7 @@ def decide(found: Found, model: PatternModel, clock: Stages) -> Decision:
         label, confidence = linking.between_sites(decided, sure, sites, chains)
         long_enough = np.repeat(chains.lengths * stripes.STEP >= MIN_CHAIN_PX, chains.lengths)
         label[chains.order[~long_enough]] = -1
-        label[linking.silhouettes(found.reduced, peaks, chains)] = -1
+        label[found.beyond] = -1
     with clock.stage("agreement"):
         agrees = description.agreement(here, evidence, model, modulation, path, (sites.start, gap))
     with clock.stage("sub-pixel"):

@@ -61,7 +61,8 @@ class Stages:
 class Found:
     """What the search for stripes and carriers found; `fault` says why it is no pattern, if it is none.
 
-    even: the peaks lie about as far apart as the pitch says.
+    even: the peaks lie about as far apart as the pitch says. beyond: (P,) peaks past an object's edge, see
+    `linking.silhouettes`.
     """
 
     fault: str | None = None
@@ -72,6 +73,7 @@ class Found:
     match: float = 0.0
     contrast: float = 0.0
     even: bool = True
+    beyond: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
     peaks: stripes.Peaks | None = None
     chains: linking.Chains | None = None
     signals: carriers.Signals | None = None
@@ -168,6 +170,12 @@ def _search(found: Found, image: Image, model: PatternModel, camera: CameraForma
         found.even = 1 / EVEN < stripes.spacing(found.peaks) / found.pitch < EVEN
     with clock.stage("chains"):
         found.chains = linking.link(found.peaks, found.pitch)
+        found.beyond = linking.silhouettes(found.reduced, found.peaks, found.chains)
+        if found.beyond.any() and carriers.are_short(found.chains, model, around):
+            # Of a narrow object what smoothing draws out past its edges is too large a share.
+            found.peaks = found.peaks.where(~found.beyond)
+            found.beyond = np.zeros(len(found.peaks), np.bool_)
+            found.chains = linking.link(found.peaks, found.pitch)
         found.signals = carriers.signals_along(image, found.peaks, found.chains, found.pitch, camera.max_value)
     if len(found.peaks) == 0:
         found.fault = "no stripes stand out of the noise"

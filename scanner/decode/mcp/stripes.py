@@ -68,6 +68,12 @@ class Peaks:
     def __len__(self) -> int:
         return len(self.y)
 
+    def where(self, kept: NDArray[np.bool_]) -> Peaks:
+        """Those of the peaks that are `kept` (P,)."""
+        start = np.concatenate(([0], np.cumsum(kept)))[self.start].astype(np.int32)
+        lines = (self.y[kept], self.height[kept], self.valley[kept], self.above[kept], self.below[kept])
+        return Peaks(start, *lines, self.clear[kept])
+
 
 def reduce_columns(image: Image) -> Array:
     """Average columns by fours and turn the image, so that a column is contiguous.
