@@ -45,6 +45,9 @@ from scanner.wire import MAX_MESSAGE_BYTES, PROTOCOL
 from service.logs import start_logging
 from service.work import Work
 
+CONNECT_MS = 1000
+"""How long to wait for the connection before the first word; a word said before it is established is lost."""
+
 _log = logging.getLogger(__name__)
 _encoder = msgspec.msgpack.Encoder()
 
@@ -73,6 +76,7 @@ class Worker:
             (zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES),
             (zmq.RECONNECT_IVL, 50),
             (zmq.RECONNECT_IVL_MAX, 1000),
+            (zmq.IMMEDIATE, 1),  # nothing waits for a daemon that is gone: the next one asks who this is
         ):
             self._socket.setsockopt(option, value)
         self._socket.connect(endpoint)
@@ -88,6 +92,7 @@ class Worker:
         thread = threading.Thread(target=self._work.serve, args=(self._jobs,), name="decoder", daemon=True)
         thread.start()
         try:
+            self._socket.poll(CONNECT_MS, zmq.POLLOUT)
             self._ready()
             self._talk(thread)
         finally:
@@ -184,7 +189,8 @@ class Worker:
 
     def _say(self, message: FromWorker) -> None:
         # No high-water mark on this side: messages are small, and there are at most `credit` of them a turn.
-        self._socket.send(_encoder.encode(message), zmq.DONTWAIT)
+        with suppress(zmq.Again):  # not connected: what is said of a series is void by the time there is a daemon
+            self._socket.send(_encoder.encode(message), zmq.DONTWAIT)
         self._said = time.monotonic()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import resource
 import signal
@@ -82,7 +83,8 @@ def test_daemon_killed_while_it_acquires(daemon: Callable[..., RunningDaemon], t
         outcome = client.wait(job_id)
         assert (outcome["state"], outcome["reason"]) == ("failed", "daemon_restarted")
         assert outcome["error"]["message"]
-        assert "open" not in (tmp_path / "state" / "spool" / job_id / "capture" / "capture.json").read_text()
+        header = (tmp_path / "state" / "spool" / job_id / "capture" / "capture.json").read_bytes()
+        assert json.loads(header)["state"] == "failed"
         assert client.scan("mcp").xyz is not None
 
 
