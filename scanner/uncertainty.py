@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scanner.calibration_spread import depth_spread
 from scanner.decode.pmp_frames import design_matrix
 from scanner.geometry import Calibration
-from scanner.patterns import Axis, GrayPmpPattern, PatternSequence, PmpPattern
+from scanner.patterns import Axis, CompositePattern, GrayPmpPattern, PatternSequence, PmpPattern
 from scanner.scan import Scan
 
 COVERAGE_FACTOR = 2.0
@@ -74,6 +74,11 @@ class Budget:
         }
 
 
+_CROSS_TALK = Contribution(
+    "method", "systematic", None, None, "cross-talk of the channels: centimetres (Casey 2011, table 5.6)"
+)
+
+
 def budget_of(
     scan: Scan, calibration: Calibration, sequence: PatternSequence, mixed: float | None, repeat: int = 1
 ) -> Budget | None:
@@ -102,7 +107,8 @@ def budget_of(
     noise = Contribution("noise", "random", noise_px, noise_mm, f"median of the points' sigmas{of_repeats}")
     fringes = _fringes(sequence)
     light = [] if fringes is None else [_response(scan, axis), _grey_levels(sequence, axis)]
-    causes = (noise, *light, _sync(sequence, mixed, axis))
+    method = [_CROSS_TALK] if isinstance(sequence.pattern, CompositePattern) else []
+    causes = (noise, *light, *method, _sync(sequence, mixed, axis))
     contributions = [_in_mm(cause, per_px) for cause in causes]
     contributions.insert(1, _calibration(scan, calibration, axis))
     return Budget(float(np.median(depth[known])), tuple(contributions))
