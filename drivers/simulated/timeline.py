@@ -122,12 +122,12 @@ class Timeline:
         found: list[Segment] = []
         off = np.inf
         for on, image in reversed(changes):
-            if on < end_ns or not found:
+            if on < end_ns:
                 found.append(Segment(image, on, off))
             if on + slow <= start_ns:
                 break
             off = on
-        return found[::-1]
+        return found[::-1] or [Segment(None, BEGINNING_NS, off)]
 
 
 def share(manner: Manner, segment: Segment, start: NDArray[np.float64], end: NDArray[np.float64], down: Plane) -> Plane:
@@ -142,8 +142,11 @@ def share(manner: Manner, segment: Segment, start: NDArray[np.float64], end: NDA
     Returns:
         float32 of the broadcast shape, 0..1.
     """
-    begun = _risen(segment.on_ns + manner.sweep_ns * down, manner.ramp_ns, start, end)
-    ended = _risen(segment.off_ns + manner.sweep_ns * down, manner.ramp_ns, start, end)
+    # From the exposure's own start: single precision, which `down` has, holds no time since the machine's start.
+    origin = float(np.min(start))
+    start, end, sweep = start - origin, end - origin, manner.sweep_ns * down
+    begun = _risen(segment.on_ns - origin + sweep, manner.ramp_ns, start, end)
+    ended = _risen(segment.off_ns - origin + sweep, manner.ramp_ns, start, end)
     return np.asarray((begun - ended) / (end - start), dtype=np.float32)
 
 

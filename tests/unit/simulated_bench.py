@@ -19,9 +19,10 @@ class Bench:
     """Camera and projector in one world."""
 
     def __init__(
-        self, device: str, camera: dict[str, Any] | None = None, projector: dict[str, Any] | None = None
+        self, device: str, camera: dict[str, Any] | None = None, projector: dict[str, Any] | None = None, up_s: int = 1
     ) -> None:
-        self.clock = VirtualClock()
+        """up_s: what the clock shows."""
+        self.clock = VirtualClock(up_s * SECOND_NS)
         self.camera: SimulatedCamera = camera_driver.open(device, camera or {}, self.clock)
         self.projector: SimulatedProjector = projector_driver.open(device, projector or {}, self.clock)
 

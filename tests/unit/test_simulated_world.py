@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.simulated import camera_driver, projector_driver
+from drivers.simulated.timeline import LoadedImage, Timeline
 from scanner.clock import VirtualClock
 from scanner.devices import CameraSettings, KnowsTruth, ProjectorKind, TriggerMode
 from scanner.errors import ConfigError, DeviceBusy, DeviceError
@@ -126,6 +127,16 @@ def test_drivers_list_a_device_for_each_rig() -> None:
         assert "board" in found[0].details["scenes"]
 
 
+def test_what_shines_later_is_not_seen() -> None:
+    shown = Timeline()
+    first, second = (LoadedImage(np.full((2, 2), value, np.uint8)) for value in (1, 2))
+    shown.show(100, first)
+    shown.show(200, second)
+    assert [segment.image for segment in shown.between(110, 190)] == [first]
+    assert [segment.image for segment in shown.between(10, 110)] == [None, first]
+    assert [segment.image for segment in shown.between(150, 210)] == [first, second]
+
+
 # --- what an exposure sees -----------------------------------------------------------------------------------------
 
 
@@ -149,9 +160,11 @@ def test_ambient_light_is_there_without_the_projector() -> None:
     assert black / (white - black) == pytest.approx(0.2, rel=0.1)
 
 
-@pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
-def test_a_change_within_an_exposure_gives_a_blended_frame(share: float) -> None:
-    bench = Bench("quick/board?noise=false&bits=12&latency_us=14000&latency_spread_us=1&settle_us=2")
+@pytest.mark.parametrize("up_s", [1, 86_400, 100 * 86_400])
+@pytest.mark.parametrize("share", [0.25, 0.75])
+def test_a_change_within_an_exposure_gives_a_blended_frame(share: float, up_s: int) -> None:
+    """On a machine that started a second ago, a day or a hundred days."""
+    bench = Bench("quick/board?noise=false&bits=12&latency_us=14000&latency_spread_us=1&settle_us=2", up_s=up_s)
     black, white = levels(bench)
     scale = 10_000_000 / 33_333_000
     seen = mean_of(change_seen(bench, share * 10_000_000))
