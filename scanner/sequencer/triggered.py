@@ -140,12 +140,17 @@ class TriggeredRounds:
         return (stays - 1) * self._plan.refresh_ns + self._plan.refresh_ns // 2
 
     def _collect(self, pairing: Pairing, take: Take, until_ns: int, *, whole: bool = False) -> None:
-        """Take frames until then; `whole`: until every pattern has one."""
+        """Take frames until then; `whole`: until every pattern has one. A host that is late takes one that waits.
+
+        Else they would pile up until the camera has no room for more.
+        """
+        taken = 0
         while not (whole and pairing.is_whole):
             left = until_ns - self._clock.now_ns()
-            frame = self._camera.pop(max(0, left)) if left > 0 or whole else None
+            frame = self._camera.pop(max(0, left)) if left > 0 or whole or not taken else None
             if frame is None:
                 return
+            taken += 1
             found = pairing.pair(frame, () if self._board is None else self._board.events())
             if found is not None:
                 take(*found)

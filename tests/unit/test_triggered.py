@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from drivers.registry import open_camera, open_projector, open_trigger
+from drivers.simulated.projector import SimulatedProjector
 from drivers.simulated.sequenced import pack
 from scanner.clock import VirtualClock
 from scanner.devices import (
@@ -233,6 +234,22 @@ def test_a_host_that_flips_late_costs_no_retakes(refreshes: float, dwell: int) -
     assert taken.acquisition.retakes == 0
     assert {verdict.verdict for verdict in taken.acquisition.verdicts} == {"proved"}
     assert taken.error_px().max() < 1
+
+
+def test_a_host_that_is_always_late_takes_its_frames_before_the_camera_has_no_room(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    on_time = SimulatedProjector.show
+
+    def late(projector: SimulatedProjector, index: int) -> Flip:
+        flip = on_time(projector, index)
+        projector._clock.sleep_until(flip.t_ns + round(0.6 * REFRESH))
+        return flip
+
+    monkeypatch.setattr(SimulatedProjector, "show", late)
+    taken = take("buffers=2")
+    assert taken.acquisition.error is None
+    assert taken.acquisition.retakes == 0
 
 
 @pytest.mark.parametrize("latency_us", [0, 9_000, 16_000, 40_000])
