@@ -41,5 +41,5 @@ def read_options(model: type[_M], options: Mapping[str, Any], device: str) -> _M
         raise ConfigError(
             f"option {key or 'table'}: {first['msg']}, got {first['input']!r}",
             device=device,
-            hint="the driver's page in docs/reference lists its options with their bounds",
+            hint="the driver's page in docs/how-to lists its options",
         ) from error
