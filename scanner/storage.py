@@ -127,10 +127,19 @@ def try_output(folder: Path, *, force: bool = False) -> None:
     Raises:
         StorageError: as `prepare_output`.
     """
-    with storage_errors(folder):
-        new = [path for path in (folder, *folder.parents) if not path.exists()]
+    new = not_there(folder)
     prepare_output(folder, force=force)
     remove_empty(new)
+
+
+def not_there(folder: Path) -> list[Path]:
+    """The folder and those around it that do not exist yet, innermost first: what making it would make.
+
+    Raises:
+        StorageError: it cannot be looked at.
+    """
+    with storage_errors(folder):
+        return [path for path in (folder, *folder.parents) if not path.exists()]
 
 
 def remove_empty(folders: Iterable[Path]) -> None:

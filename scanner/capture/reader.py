@@ -191,7 +191,10 @@ def _read_npy_header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
 def _read_image(path: Path, camera: CameraFormat) -> Pixels:
     if not path.is_file():
         raise DecodeError(f"frame {path} is missing")
-    content = path.read_bytes()
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise DecodeError(f"frame {path} cannot be read: {error.strerror}") from error
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
     # OpenCV fills a JPEG that breaks off with grey and says nothing.
     if image is None or (content[:2] == b"\xff\xd8" and b"\xff\xd9" not in content[-64:]):

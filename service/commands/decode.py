@@ -83,17 +83,19 @@ def decode(
         from scanner.capture import Capture  # noqa: PLC0415  (array libraries and kernels)
         from scanner.reconstruct import DecodeOptions, calibration_for, reconstruct  # noqa: PLC0415
         from scanner.stage_pictures import StageFolder  # noqa: PLC0415
-        from scanner.storage import prepare_output  # noqa: PLC0415
+        from scanner.storage import not_there, prepare_output, remove_empty  # noqa: PLC0415
 
         chosen = {"decoder": decoder, "filters": filters, "compare_truth": compare_truth}
         options = DecodeOptions.from_dict({**chosen, "correct_ripple": correct_ripple})
         opened = Capture.open(capture)
         lens_file = calibration_for(opened, calibration)
         folder = output or opened.path / "scan"
-        new = [f for f in (folder, stages) if f is not None and not f.exists()]
-        prepare_output(folder, force=force)
-        observer = None if stages is None else StageFolder(prepare_output(stages, force=force))
+        new = [not_there(made_here) for made_here in (stages, folder) if made_here is not None]
+        observer: StageFolder | None = None
         try:
+            prepare_output(folder, force=force)
+            if stages is not None:
+                observer = StageFolder(prepare_output(stages, force=force))
             made = reconstruct(opened, lens_file, options, lines.stage, observer)
             lines.stage("writing files")
             made.save(folder)
@@ -101,9 +103,8 @@ def decode(
             # The stages up to a failure stay: they are what it is looked for with.
             if observer is not None and observer.written:
                 lines.note(f"stages up to the failure: {stages}")
-            for made_here in reversed(new):
-                if made_here.exists() and not any(made_here.iterdir()):
-                    made_here.rmdir()
+            for made_here in new:
+                remove_empty(made_here)
             raise
         if observer is not None:
             lines.note(f"{len(observer.written)} stages: {stages}")

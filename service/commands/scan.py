@@ -136,11 +136,10 @@ class Place:
     @contextmanager
     def made(self) -> Iterator[Path]:
         """The folder; one that was made for files that do not arrive is removed again."""
-        from scanner.storage import prepare_output, remove_empty, storage_errors  # noqa: PLC0415
+        from scanner.storage import not_there, prepare_output, remove_empty  # noqa: PLC0415
 
         folder = self.folder
-        with storage_errors(folder):
-            new = [path for path in (folder, *folder.parents) if not path.exists()]
+        new = not_there(folder)
         prepare_output(folder, force=self.force)
         incoming = folder / INCOMING
         shutil.rmtree(incoming, ignore_errors=True)  # of a command that was killed: its files are another scan's

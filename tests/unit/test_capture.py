@@ -180,6 +180,18 @@ def write_images(folder: Path, images: list[np.ndarray]) -> list[str]:
     return names
 
 
+def test_an_image_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = write_images(tmp_path / "c", [frame(0)] * 3)
+    capture = Capture.open(image_capture(tmp_path / "c", names))
+
+    def refuse(_: Path) -> bytes:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    with pytest.raises(DecodeError, match=r"1\.png cannot be read: Permission denied"):
+        capture.frame(1)
+
+
 def test_image_files_are_read_colour_as_luma(tmp_path: Path) -> None:
     grey = frame(1)
     colour = np.repeat(frame(2)[..., None], 3, axis=2)

@@ -430,10 +430,10 @@ def test_bad_calibrations_are_refused(changes: dict[str, Any], run: Run, capture
     assert run("decode", capture, "--calibration", good, "-o", "good")[0] == 0
     bad = tmp_path / "bad.json"
     bad.write_text(json.dumps(calibration(**changes)))
-    status, _, err = run("decode", capture, "--calibration", bad, "-o", "out")
+    status, _, err = run("decode", capture, "--calibration", bad, "-o", "deep/out")
     assert status == 1
     assert err.startswith("opening") or "error:" in err
-    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "deep").exists()
 
 
 def test_status_tells_what_a_daemon_answers() -> None:
