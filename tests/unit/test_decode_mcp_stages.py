@@ -16,6 +16,7 @@ from scanner.decode.mcp import (
     hmm,
     linking,
     magnification,
+    profiles,
     ranks,
     stripes,
     subpixel,
@@ -392,3 +393,44 @@ def test_ranks_are_numpy_s(count):
     shares = (0.0, 0.01, 0.37, 0.99, 1.0)
     np.testing.assert_allclose(ranks.quantiles(values, *shares), np.quantile(values, shares), rtol=1e-5, atol=1e-6)
     assert ranks.median(values) == pytest.approx(float(np.median(values)), rel=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 5, 40, 97])
+def test_sums_over_averaged_profiles_are_those_written_out(count):
+    random, reach = np.random.default_rng(count), 6
+    stride, pad = profiles.stride_of(count), profiles.PAD
+    profile = np.full((2 * reach + 1, stride), np.nan, np.float32)
+    usable, bend = np.full(stride, np.nan, np.float32), np.full(stride, np.nan, np.float32)
+    here = slice(pad, pad + count)
+    profile[:, here] = random.uniform(0, 50, (2 * reach + 1, count))
+    usable[here], bend[here] = random.integers(1, reach + 1, count), random.uniform(-0.01, 0.01, count)
+    used, sums = np.empty(stride, np.float32), np.empty((profiles.SUMS, stride), np.float32)
+    profiles.add_up(profile.ravel(), usable, bend, count, stride, reach, used, sums.ravel())
+    expected, least = np.zeros((profiles.SUMS, count)), np.zeros(count)
+    for p in range(count):
+        window = slice(pad + max(p - profiles.HALF_COLUMNS, 0), pad + min(p + profiles.HALF_COLUMNS, count - 1) + 1)
+        mean, least[p] = np.float64(profile[:, window]).mean(axis=1), usable[window].min()
+        for u in range(1, int(least[p])):
+            even, odd = (mean[reach + u] + mean[reach - u]) / 2, (mean[reach + u] - mean[reach - u]) / 2
+            beside = [mean[reach + v] + mean[reach - v] for v in (u - 1, u + 1)]
+            shift, slope = (beside[0] - beside[1]) / 4, even * u
+            odd -= bend[pad + p] * u * u * shift
+            terms = (shift * shift, shift * slope, slope * slope, odd * shift, odd * slope, odd * odd)
+            expected[:, p] += terms
+    np.testing.assert_array_equal(used[here], least)
+    np.testing.assert_allclose(sums[:, here], expected, rtol=1e-3, atol=0.02)
+    kappa, worth, slope = (np.zeros(stride, np.float32) for _ in range(3))
+    profiles.slopes(sums.ravel(), used, count, stride, kappa, worth, slope)
+    ss, sv, vv, os, ov, _ = np.float64(sums[:, here])
+    apart = (least >= 4) & (ss * vv - sv * sv > 1e-4 * ss * vv)
+    determinant, square = np.where(apart, ss * vv - sv**2, 1), np.where(apart, ss, 1)
+    k, w = apart * (ss * ov - sv * os) / determinant, apart * determinant / square
+    for p in range(count):
+        window = slice(max(p - profiles.SLOPE_COLUMNS, 0), p + profiles.SLOPE_COLUMNS + 1)
+        if w[window].sum() == 0:
+            assert slope[pad + p] == 0
+            continue
+        mean = np.average(k[window], weights=w[window])
+        scatter = np.average((k[window] - mean) ** 2, weights=w[window])
+        doubt = 0.25 * scatter / max(1, len(k[window]) / (2 * profiles.HALF_COLUMNS + 1))
+        assert slope[pad + p] == pytest.approx(mean * mean**2 / (mean**2 + doubt), rel=0.02, abs=1e-5)

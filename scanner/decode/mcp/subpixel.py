@@ -15,18 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.decode.mcp import profiles
 from scanner.decode.mcp.linking import Chains
 from scanner.decode.mcp.stripes import Peaks
-from scanner.kernel import kernel, summing_kernel
+from scanner.kernel import kernel
 
 Array = NDArray[np.float32]
 Ints = NDArray[np.int32]
-
-HALF_COLUMNS = 3
-"""Columns (of four pixels) averaged to either side: 28 px in all, a carrier's period or two."""
-
-SLOPE_COLUMNS = 8
-"""Columns over which the slope of brightness is averaged to either side: shading changes slower than position."""
 
 REACH = 0.42
 """Half the fit window in pitches: the flanks without the rounded valley."""
@@ -131,15 +126,12 @@ def _smoothed(y: Array, runs: Ints, ends: Ints) -> Array:
     for r in range(len(ends) - 1):
         first, last = ends[r], ends[r + 1]
         for p in range(first, last):
-            half = min(HALF_COLUMNS, p - first, last - 1 - p)
+            half = min(profiles.HALF_COLUMNS, p - first, last - 1 - p)
             total = np.float32(0)
             for q in range(p - half, p + half + 1):
                 total += y[runs[q]]
             out[runs[p]] = total / np.float32(2 * half + 1)
     return out
-
-
-# Rows of matrices are named by matrix and number: a slice of its own costs more than the loop over 31 samples.
 
 
 @kernel
@@ -167,90 +159,10 @@ def _lead_on(guess: Array, runs: Ints, ends: Ints, size: int, side: np.float32, 
 
 
 @kernel
-def _straighten(reduced: Array, b: int, centre: np.float32, p: int, profile: Array) -> None:
-    """profile[p, u] = column b at centre + u - reach, between samples linearly."""
-    samples, size = profile.shape[1], reduced.shape[1]
-    base = int(np.floor(centre))
-    f = centre - base
-    begin = base - samples // 2
-    if begin >= 0 and begin + samples < size:
-        for u in range(samples):
-            profile[p, u] = reduced[b, begin + u] + (reduced[b, begin + u + 1] - reduced[b, begin + u]) * f
-        return
-    for u in range(samples):
-        a = min(max(begin + u, 0), size - 2)
-        profile[p, u] = reduced[b, a] + (reduced[b, a + 1] - reduced[b, a]) * f
-
-
-@kernel
 def _room(size: int, g: np.float32, above: np.float32, below: np.float32, reach: int) -> int:
     """Samples to either side of a peak: within the image, and short of the neighbours' flanks where foreshortened."""
     near = np.float32(0.9) * min(g - above, below - g)
     return int(min(np.float32(reach), g, size - 1 - g, near))
-
-
-@summing_kernel
-def _products(mean: Array, reach: int, limit: int, bend: np.float32, p: int, sums: Array) -> None:
-    """sums[p]: over the window shift x shift, shift x slope, slope x slope, odd x shift, odd x slope, odd x odd.
-
-    The odd part of the profile `mean`, less what the bend of the surface makes of it, is explained by a shift (the even
-    part's derivative) and a slope of brightness (the even part times the distance).
-    """
-    ss, sv, vv = np.float32(0), np.float32(0), np.float32(0)
-    os, ov, oo = np.float32(0), np.float32(0), np.float32(0)
-    for u in range(1, limit):
-        right, left = mean[reach + u], mean[reach - u]
-        odd = np.float32(0.5) * (right - left)
-        slope = np.float32(0.5) * (right + left) * np.float32(u)
-        inner, outer = mean[reach + u - 1] + mean[reach - u + 1], mean[reach + u + 1] + mean[reach - u - 1]
-        shift = np.float32(0.25) * (inner - outer)
-        odd -= bend * np.float32(u * u) * shift
-        ss += shift * shift
-        sv += shift * slope
-        vv += slope * slope
-        os += odd * shift
-        ov += odd * slope
-        oo += odd * odd
-    sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3], sums[p, 4], sums[p, 5] = ss, sv, vv, os, ov, oo
-
-
-@summing_kernel
-def _slope_at(p: int, count: int, kappa: Array, worth: Array) -> np.float32:
-    """The slope of brightness about place `p` of a run, shrunk by its own significance."""
-    slope, weight, square = np.float32(0), np.float32(0), np.float32(0)
-    lo, hi = max(p - SLOPE_COLUMNS, 0), min(p + SLOPE_COLUMNS, count - 1)
-    for q in range(lo, hi + 1):
-        slope += worth[q] * kappa[q]
-        square += worth[q] * kappa[q] * kappa[q]
-        weight += worth[q]
-    if weight <= 0:
-        return np.float32(0)
-    slope /= weight
-    # The scatter along the stripe says how sure it is; windows of 7 columns overlap.
-    scatter = max(square / weight - slope * slope, np.float32(0))
-    independent = max(np.float32(1), np.float32(hi - lo + 1) / np.float32(2 * HALF_COLUMNS + 1))
-    return slope * (slope * slope / (slope * slope + np.float32(0.25) * scatter / independent + np.float32(1e-12)))
-
-
-@summing_kernel
-def _window_sums(
-    profile: Array, ground: Array, usable: Ints, p: int, count: int, bend: np.float32, mean: Array, sums: Array
-) -> int:
-    """Average the profiles about place `p` of a run, and sum their products; returns the samples used to a side."""
-    samples = profile.shape[1]
-    lo, hi = max(p - HALF_COLUMNS, 0), min(p + HALF_COLUMNS, count - 1)
-    limit = int(usable[p])
-    for u in range(samples):
-        mean[u] = np.float32(0)
-    for q in range(lo, hi + 1):
-        limit = min(limit, int(usable[q]))
-        for u in range(samples):
-            mean[u] += profile[q, u] - ground[q]
-    share = np.float32(1) / np.float32(hi - lo + 1)
-    for u in range(samples):
-        mean[u] *= share
-    _products(mean, samples // 2, limit, bend, p, sums)
-    return limit
 
 
 @kernel
@@ -282,48 +194,45 @@ def _refine(
     whole: NDArray[np.uint8],
 ) -> None:
     longest = _longest_run(ends)
-    profile = np.empty((longest, 2 * reach + 1), np.float32)
-    mean = np.empty(2 * reach + 1, np.float32)
-    ground, kappa, worth = np.empty(longest, np.float32), np.empty(longest, np.float32), np.empty(longest, np.float32)
-    usable, used = np.zeros(longest, np.int32), np.zeros(longest, np.int32)
-    sums = np.empty((longest, 6), np.float32)
+    samples, stride = 2 * reach + 1, profiles.stride_of(longest)
+    profile, sums = np.empty(samples * stride, np.float32), np.empty(profiles.SUMS * stride, np.float32)
+    usable, bends, used = np.empty(stride, np.float32), np.empty(stride, np.float32), np.empty(stride, np.float32)
+    kappa, worth, slopes = np.empty(stride, np.float32), np.empty(stride, np.float32), np.empty(stride, np.float32)
     edge = np.float32(EDGE / REACH) * np.float32(reach)
     lean = np.float32(LEAN / REACH / REACH) * np.float32(reach * reach)
     for r in range(len(ends) - 1):
         first, count = ends[r], ends[r + 1] - ends[r]
         for p in range(count):
             k = runs[first + p]
-            usable[p] = _room(reduced.shape[1], guess[k], above[k], below[k], reach)
-            ground[p] = valley[k]
-            _straighten(reduced, column[k], guess[k], p, profile)
+            at = profiles.PAD + p
+            usable[at] = _room(reduced.shape[1], guess[k], above[k], below[k], reach)
+            bends[at] = bend[k]
+            profiles.straighten(reduced, column[k], guess[k], valley[k], p, stride, samples, profile)
+        profiles.add_up(profile, usable, bends, count, stride, reach, used, sums)
+        profiles.slopes(sums, used, count, stride, kappa, worth, slopes)
         for p in range(count):
-            used[p] = _window_sums(profile, ground, usable, p, count, bend[runs[first + p]], mean, sums)
-            ss, sv, vv, os, ov = sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3], sums[p, 4]
-            determinant = ss * vv - sv * sv
-            apart = used[p] >= 4 and determinant > np.float32(1e-4) * ss * vv
-            kappa[p] = (ss * ov - sv * os) / determinant if apart else np.float32(0)
-            worth[p] = determinant / ss if apart else np.float32(0)
-        for p in range(count):
-            ss, sv, vv, os, ov, oo = sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3], sums[p, 4], sums[p, 5]
+            at = profiles.PAD + p
+            ss, sv, vv = sums[at], sums[at + stride], sums[at + 2 * stride]
+            os, ov, oo = sums[at + 3 * stride], sums[at + 4 * stride], sums[at + 5 * stride]
             k = runs[first + p]
-            if used[p] < 2 or ss <= 0:
+            if used[at] < 2 or ss <= 0:
                 if led[k] and 0 <= guess[k] <= reduced.shape[1] - 1:
                     y[k], whole[k] = guess[k], 1  # its sigma stays
                 continue
-            slope = np.float32(0) if even else _slope_at(p, count, kappa, worth)
+            slope = np.float32(0) if even else slopes[at]
             shift = (os - slope * sv) / ss
             left = (
                 oo - 2 * shift * os - 2 * slope * ov + shift * shift * ss + 2 * shift * slope * sv + slope * slope * vv
             )
-            rough = np.sqrt(max(left, np.float32(0)) / np.float32(max(used[p] - 2, 1)))
-            if used[p] < FEW:
+            rough = np.sqrt(max(left, np.float32(0)) / np.float32(max(used[at] - 2, 1)))
+            if used[at] < FEW:
                 rough = max(rough, SMOOTH * height[k])
             sigma[k] = ALIKE * rough / np.sqrt(ss) + SIGMA_FLOOR
             y[k] = guess[k] + shift
             # Shading moves the top, and leaves little else.
             explained = slope * lean if sigma[k] < edge * SHADED else np.float32(0)
             apart = abs(y[k] + explained - top[k])
-            if used[p] >= FEW and sigma[k] > edge * EDGE_SIGMA and apart > max(edge, CLEARLY * sigma[k]):
+            if used[at] >= FEW and sigma[k] > edge * EDGE_SIGMA and apart > max(edge, CLEARLY * sigma[k]):
                 y[k], sigma[k] = top[k], max(sigma[k], np.float32(0.25) * apart)
             far = abs(shift) > np.float32(0.35) * np.float32(reach)
             whole[k] = 0 if far or rough > ROUGH * height[k] else 1
