@@ -199,7 +199,7 @@ class DevicesProcess:
             if opened is not None:
                 opened.loaded = None
         if command.rate_hz > 0 and opened is not None:
-            self._previewer = Previewer(opened.rig, self._clock, command)
+            self._previewer = Previewer(opened.rig, self._clock, command, opened.exposure)
 
     def _read(self) -> None:
         while (command := read_command(self._commands)) is not None:

@@ -9,12 +9,14 @@ from __future__ import annotations
 import itertools
 import os
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 import zmq
+from numpy.typing import NDArray
 
 from scanner.clock import Clock
-from scanner.devices import Image, TriggerMode
+from scanner.devices import CameraCapabilities, CameraSettings, Image, TriggerMode
 from scanner.sequencer import Rig
 from scanner.wire import MAX_MESSAGE_BYTES
 from scanner.wire_images import PreviewHeader, encode_image
@@ -22,12 +24,24 @@ from service.pipe import Preview
 from service.sockets import remove_sockets
 
 POP_NS = 500_000_000
+BRIGHT, DARK, GOOD = 0.97, 0.3, 0.7
+"""Of full scale, the 99th percentile of a picture: from where it is clipped, to where it is dark, and what is aimed at.
+What lies between is left alone, so that the picture does not pump."""
+FASTER, SLOWER = 0.4, 4.0
+"""Factors on the exposure from one picture to the next: what is clipped does not say by how much."""
+LIT_NS = 300_000_000
+"""After the projector was told to show white (slow ones take 0.1 s): pictures from before say nothing of its light."""
+LONGEST_NS = 200_000_000
+"""Exposure that a preview goes to by itself: five pictures a second, also of a dark view."""
 
 
 class Previewer:
     """A running preview; the projector shows white meanwhile, so that there is something to see."""
 
-    def __init__(self, rig: Rig, clock: Clock, wanted: Preview) -> None:
+    def __init__(self, rig: Rig, clock: Clock, wanted: Preview, exposure_us: float | str | None = None) -> None:
+        """exposure_us: of the rig file; where it gives none, or "auto", pictures find their own."""
+        self._adapts = not isinstance(exposure_us, int | float)
+        self._exposure_ns = round(1000 * exposure_us) if isinstance(exposure_us, int | float) else None
         self._rig = rig
         self._clock = clock
         self._period_ns = round(1e9 / wanted.rate_hz)
@@ -78,6 +92,13 @@ class Previewer:
         )
         with suppress(zmq.Again):
             self._socket.send(encode_image(header, small.data.cast("B")), zmq.DONTWAIT)
+        if self._adapts and frame.exposure.start_ns > self._lit_ns:
+            taken_ns = frame.exposure.end_ns - frame.exposure.start_ns
+            better = better_exposure(small, taken_ns, camera.capabilities)
+            if better is not None:
+                self._exposure_ns = better
+                camera.stop()  # the pixels were the camera's until here
+                self._start()
 
     def rest(self) -> bool:
         """Stop the camera for a scan; the next `show` starts it again. Whether it ran."""
@@ -102,5 +123,29 @@ class Previewer:
         projector.show(0)
         modes = camera.capabilities.trigger_modes
         self._mode = TriggerMode.SOFTWARE if TriggerMode.SOFTWARE in modes else TriggerMode.FREE
-        camera.start(self._mode)
+        self._lit_ns = self._clock.now_ns() + LIT_NS
+        self._start()
         self._running = True
+
+    def _start(self) -> None:
+        camera = self._rig.camera
+        if self._exposure_ns is not None:
+            camera.apply(CameraSettings(exposure_ns=self._exposure_ns))
+        camera.start(self._mode)
+
+
+def better_exposure(pixels: NDArray[Any], taken_ns: int, capabilities: CameraCapabilities) -> int | None:
+    """The exposure for the next picture, ns; None where this one's will do, or none is better.
+
+    Args:
+        pixels: (H, W) grey levels.
+        taken_ns: how long they were exposed.
+        capabilities: of the camera.
+    """
+    level = float(np.percentile(pixels, 99)) / capabilities.max_value
+    if DARK <= level <= BRIGHT:
+        return None
+    factor = FASTER if level > BRIGHT else min(GOOD / max(level, 1e-3), SLOWER)
+    longest = max(capabilities.exposure_min_ns, min(LONGEST_NS, capabilities.exposure_max_ns))
+    better = round(min(max(taken_ns * factor, capabilities.exposure_min_ns), longest))
+    return better if abs(better - taken_ns) > 0.05 * taken_ns else None
