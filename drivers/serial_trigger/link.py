@@ -175,6 +175,8 @@ class Link:
 
     def _give_up(self, lost: DeviceLost) -> None:
         self.lost = lost
+        # At once: while the old port is held, the kernel gives the board another number when it comes back.
+        self._transport.close()
         self._answers.put((self._clock.now_ns(), lost))
 
     # --- the asking thread ---------------------------------------------------------------------------------------
