@@ -192,9 +192,11 @@ class AravisCamera:
         """Give the device back; may be called twice."""
         if not self._open:
             return
-        self.stop()
         self._open = False
-        self._links.close()
+        try:
+            self.stop()
+        finally:
+            self._links.close()
 
     # --- on the link's thread --------------------------------------------------------------------------------------
 
@@ -292,8 +294,10 @@ class AravisCamera:
         link.camera.set_frame_rate(wanted or fastest)
 
     def _finish(self, link: Link) -> None:
-        link.features.execute("AcquisitionStop")
-        self._drop_stream(link)
+        try:
+            link.features.execute("AcquisitionStop")
+        finally:
+            self._drop_stream(link)
 
     def _drop_stream(self, link: Link) -> None:
         stream, link.stream = link.stream, None

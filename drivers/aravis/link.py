@@ -208,15 +208,15 @@ class Link:
         if stream is not None:
             stream.close()
         del stream
-        if self._camera is not None:
-            try:
-                if not self.lost.is_set():
-                    self.features.execute_if_there("AcquisitionStop")
-            finally:
+        try:
+            if self._camera is not None and not self.lost.is_set():
+                self.features.execute_if_there("AcquisitionStop")
+        finally:  # a camera that refuses is given back all the same
+            if self._camera is not None:
                 self.features.forget()
-        self._camera = None
-        if self._control is not None:
-            self._control.close()
+            self._camera = None
+            if self._control is not None:
+                self._control.close()
 
     def _probe(self) -> GvcpProbe | CallProbe:
         if self.is_gige:

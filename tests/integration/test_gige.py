@@ -340,6 +340,19 @@ def test_a_camera_that_somebody_else_controls_is_busy() -> None:
         camera_driver.open(ADDRESS, {}, MonotonicClock())
 
 
+def test_a_camera_that_refuses_to_stop_is_given_back_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pair() as it:
+        it.camera.start(TriggerMode.FREE)
+
+        def refuse(command: str) -> None:
+            raise DeviceError(f"{command} is refused")
+
+        monkeypatch.setattr(it.camera._running.features, "execute", refuse)
+        with pytest.raises(DeviceError, match="AcquisitionStop"):
+            it.camera.close()
+        camera_driver.open(ADDRESS, {}, MonotonicClock()).close()
+
+
 def test_an_address_where_nobody_is() -> None:
     with pytest.raises(DeviceNotFound, match=r"127\.0\.0\.99"):
         camera_driver.open("127.0.0.99", {}, MonotonicClock())
