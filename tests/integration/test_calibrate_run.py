@@ -23,12 +23,12 @@ POSES = 3
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A fast rig that knows its latency, so that no test waits for either."""
     path = tmp_path_factory.mktemp("rig") / "rig.toml"
-    device = "quick/chessboard_poses?walk=true&exposure_scale=2"
+    device = "quick/chessboard_poses?walk=true&exposure_scale=4"
     path.write_text(
         f'[rig]\nname = "walk"\n[camera]\ndriver = "simulated"\ndevice = "{device}"\n'
-        f'[projector]\ndriver = "simulated"\ndevice = "{device}"\nlatency_us = [4000, 4400]\nsettle_us = [100, 300]\n'
-        "[projector.options]\nrefresh_ns = 8_000_000\n"
-        "[camera.options]\nreadout_us = 1000\n[camera.settings]\nexposure_us = 8000\n"
+        f'[projector]\ndriver = "simulated"\ndevice = "{device}"\nlatency_us = [300, 700]\nsettle_us = [100, 300]\n'
+        "[projector.options]\nrefresh_ns = 8_000_000\nlatency_us = 500\n"
+        "[camera.options]\nreadout_us = 300\n[camera.settings]\nexposure_us = 4000\n"
     )
     return path
 
