@@ -160,7 +160,10 @@ class DaemonConfig(Table):
     spool: RelativePath | None = Field(default=None, description="path of the folder that captures are written to")
     spool_limit_gb: float | None = Field(default=None, gt=0, le=1_000_000, description="gigabytes, more than 0")
     retention: RetentionConfig = Field(default=RetentionConfig(), description="a table [daemon.retention]")
-    client_keys: RelativePath | None = Field(default=None, description="path of the folder of clients' public keys")
+    client_keys: RelativePath | None = Field(
+        default=None,
+        description="path of the folder of clients' public keys, for encrypted endpoints; not used yet",
+    )
     workers: int = Field(
         default=1, ge=0, le=64, description="decode workers to start, 0 .. 64 (0: only those of other hosts)"
     )
