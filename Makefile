@@ -21,8 +21,9 @@ scan: setup ## scan the simulated rig; ARGS="--method mcp" and the like are pass
 test: setup ## all tests; ARGS="-k config" and the like are passed on
 	@setup/firmware-tools.sh
 	@$(bin)/python -m pytest -q -n auto --maxprocesses 4 --dist loadgroup $(ARGS)
+	@setup/rig.sh told
 
-rig: ## the drivers against the kernel's virtual devices, in a guest under QEMU
+rig: ## drivers against the kernel's virtual devices, the service under systemd: in a guest under QEMU
 	@setup/install.sh --no-kernels
 	@setup/rig.sh
 

@@ -11,7 +11,7 @@ from itertools import pairwise
 from typing import Any
 
 from scanner.clock import Clock
-from scanner.devices import CameraSettings, ChecksSetup, ProjectorKind, TableSlot, TriggerSource
+from scanner.devices import CameraSettings, ChecksSetup, ProjectorKind, Source, TableSlot, TriggerSource
 from scanner.errors import ScannerError
 from scanner.sequencer import Rig, measure_latency
 from scanner.sequencer.light import Light, measure_light
@@ -80,6 +80,13 @@ def host(opened: OpenRig, clock: Clock) -> Iterator[Finding]:
         for found in camera.check_setup():
             level = Level.OK if found.ok else Level.BAD
             yield Finding(found.subject, level, found.text, found.command or ("" if found.ok else SMALLER))
+    stamp = camera.capabilities.stamp
+    said = f"frames are stamped by {stamp.value}, true within {camera.capabilities.stamp_bound_ns / 1e6:.2f} ms"
+    if stamp is Source.ESTIMATED:
+        mend = "nothing is proved by estimates; the driver's page of the documentation says how to measure its stamps"
+        yield Finding("stamps", Level.NOTE, said, mend)
+    else:
+        yield Finding("stamps", Level.OK, said)
 
 
 def latency(opened: OpenRig, clock: Clock) -> Iterator[Finding]:
@@ -145,6 +152,10 @@ def picture(opened: OpenRig, clock: Clock) -> Iterator[Finding]:
     steady = abs(found.patch - 1) <= MOST_DYNAMIC
     mend = "switch the projector's dynamic contrast, iris and eco modes off, and the camera's automatics"
     yield Finding("dynamics", Level.OK if steady else Level.BAD, said, "" if steady else mend)
+    said = f"black differs by {found.room:.2%} of white from frame to frame"
+    calm = found.room < MOST_FLICKER
+    mend = "keep the room's lamps off it, or expose for whole periods of mains light: 10 ms at 50 Hz, 8.33 ms at 60 Hz"
+    yield Finding("room light", Level.OK if calm else Level.BAD, said, "" if calm else mend)
     yield _rate(found.refresh_ns, declared.refresh_ns)
 
 

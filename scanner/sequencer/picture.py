@@ -1,5 +1,5 @@
-"""What a projector does to a picture on its way: whether pixels stay pixels, whether the lamp follows the content, and
-whether it refreshes at the rate it says.
+"""What becomes of a picture on its way: whether pixels stay pixels, whether the lamp follows the content, what other
+light there is, and whether the projector refreshes at the rate it says.
 
 Test shots outside a run, of the part that the projector lights. Keystone, overscan and scaling make new pixels out of
 neighbours; dynamic contrast, iris and automatic exposure change all greys with the mean of the picture. All of it is
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scanner.clock import Clock
 from scanner.devices import Camera, CameraSettings, Flip, Projector, Source, TriggerMode
-from scanner.sequencer.light import fitting_exposure, grey_levels, lit_part
+from scanner.sequencer.light import FRAMES, fitting_exposure, grey_levels, lit_part
 from scanner.sequencer.shots import BLACK, WHITE, Shots
 
 CHECKER, PATCH = 2, 3
@@ -37,6 +37,8 @@ class Picture:
     half way between black and white, and over all phases of a scaled picture a third (1 / (1 + gamma))"""
     patch: float
     """light of a white patch on black, of the same place's in a white picture: 1, and more by stray light"""
+    room: float
+    """standard deviation of black from frame to frame, of white minus black: other light that swings"""
     refresh_ns: float | None
     """measured over a second of flips; None where their stamps are estimates"""
 
@@ -65,7 +67,9 @@ def measure_picture(
         black, white = grey_levels(shots, BLACK), grey_levels(shots, WHITE)
         lit = lit_part(white - black, camera.capabilities.max_value, shots)
         share = [np.where(lit, (grey_levels(shots, i) - black) / np.where(lit, white - black, 1), 0) for i in (2, 3)]
-        return Picture(float(share[0][lit].mean()), _core(share[1], lit), _refresh(shots))
+        dark = [grey_levels(shots, BLACK)[lit].mean() for _ in range(FRAMES)]
+        room = float(np.std(dark, ddof=1) / (white - black)[lit].mean())
+        return Picture(float(share[0][lit].mean()), _core(share[1], lit), room, _refresh(shots))
 
 
 def _images(height: int, width: int) -> list[NDArray[np.uint8]]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,6 +17,7 @@ from drivers.registry import open_camera, open_projector
 from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.projector import SimulatedProjector
 from scanner.clock import VirtualClock
+from scanner.devices import CameraFrame, Source
 from scanner.sequencer.light import measure_light
 from service import doctor, doctor_rig
 from service.config import RigConfig, simulated_rig
@@ -200,9 +203,10 @@ def test_a_picture_that_comes_as_it_is_sent_is_sound(monkeypatch: pytest.MonkeyP
     assert [(found.subject, found.level) for found in findings] == [
         ("pixels", Level.OK),
         ("dynamics", Level.OK),
+        ("room light", Level.OK),
         ("refresh", Level.OK),
     ]
-    assert "60.000 Hz" in findings[2].says
+    assert "60.000 Hz" in findings[3].says
 
 
 def test_keystone_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,6 +222,27 @@ def test_dynamic_contrast_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     found = one(pictured(monkeypatch, dimmed), "dynamics")
     assert found.level is Level.BAD
     assert "dynamic contrast" in found.mend
+
+
+def test_light_that_swings_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    pop, swing = SimulatedCamera.pop, itertools.cycle((0, 3, 1, 4))
+
+    def lit(self: SimulatedCamera, timeout_ns: int) -> CameraFrame | None:
+        frame = pop(self, timeout_ns)
+        return frame and replace(frame, pixels=frame.pixels + np.uint8(next(swing)))
+
+    monkeypatch.setattr(SimulatedCamera, "pop", lit)
+    found = one(pictured(monkeypatch, lambda image: image), "room light")
+    assert found.level is Level.BAD
+    assert "50 Hz" in found.mend
+
+
+def test_stamps_that_prove_nothing_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert one(examined("quick/board"), "stamps").level is Level.OK
+    honest = SimulatedCamera.capabilities
+    estimated = property(lambda self: replace(honest.fget(self), stamp=Source.ESTIMATED))
+    monkeypatch.setattr(SimulatedCamera, "capabilities", estimated)
+    assert one(examined("quick/board"), "stamps").level is Level.NOTE
 
 
 def test_a_rate_that_is_another_is_told() -> None:
