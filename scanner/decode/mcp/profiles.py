@@ -17,10 +17,10 @@ Array = NDArray[np.float32]
 HALF_COLUMNS = 3
 """Columns (of four pixels) averaged to either side: 28 px in all, a carrier's period or two."""
 
-SLOPE_COLUMNS = 8
+SLOPE_COLUMNS = 14
 """Columns over which the slope of brightness is averaged to either side: shading changes slower than position."""
 
-PAD = 8
+PAD = 16
 """Places before the first: as many as the wider window reaches."""
 
 SUMS = 6
@@ -165,5 +165,5 @@ def slopes(sums: Array, used: Array, count: int, stride: int, kappa: Array, wort
         mean = total / weight
         scatter = greatest(square / weight - mean * mean, np.float32(0))
         squared = mean * mean
-        doubt = scatter * np.float32(0.25) / load(independent, 0) + np.float32(1e-12)
+        doubt = scatter / load(independent, 0) + np.float32(1e-12)
         store(slope, at, choose(weight > np.float32(0), mean * (squared / (squared + doubt)), np.float32(0)))

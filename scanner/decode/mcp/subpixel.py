@@ -38,6 +38,10 @@ CLEARLY = np.float32(2.5)
 not leave (its sigma, in the same measure), saw an edge of depth or print in its window: the peak's top, a window of a
 twelfth of a pitch, saw less of it."""
 
+LIFT = 0.18
+"""What smoothing by a twelfth of a pitch lifts a triangle's valleys by, of the height that it leaves (.133 of .734):
+the light whose slope is fitted begins below them."""
+
 LEAN = 0.04
 """How far a slope of brightness moves a peak's top, in squared pitches: height over curvature there, of a triangle that
 a Gaussian of a twelfth of a pitch has rounded (.038; with a pixel of blur before it .042 at most)."""
@@ -207,7 +211,8 @@ def _refine(
             at = profiles.PAD + p
             usable[at] = _room(reduced.shape[1], guess[k], above[k], below[k], reach)
             bends[at] = bend[k]
-            profiles.straighten(reduced, column[k], guess[k], valley[k], p, stride, samples, profile)
+            base = valley[k] - np.float32(LIFT) * height[k]
+            profiles.straighten(reduced, column[k], guess[k], base, p, stride, samples, profile)
         profiles.add_up(profile, usable, bends, count, stride, reach, used, sums)
         profiles.slopes(sums, used, count, stride, kappa, worth, slopes)
         for p in range(count):
