@@ -57,6 +57,9 @@ class Pipeline:
 
     def start(self, recover_live: Callable[[Job], Coroutine[Any, Any, None]]) -> None:
         """Take up what an earlier daemon left, then begin with the queue. Live runs are `recover_live`'s."""
+        for job in self.store:
+            if job.files and not job.deleted and not self.spool.folder(job.id).exists():
+                job.deleted = True  # by a daemon that ended before it could say so
         for job in self.store.unfinished():
             self.spawn(recover_live(job) if isinstance(job.params, LiveStart) else self._recover(job))
         self.spawn(self._acquire_all())

@@ -80,14 +80,18 @@ class Spool:
         """Delete what may go, oldest first, until `needed` more bytes fit; returns the jobs whose files went.
 
         Raises:
-            StorageError: they do not fit even so; nothing that must stay was touched.
+            StorageError: they would not fit even so: nothing was deleted.
         """
         gone: list[Job] = []
-        candidates = iter([job for job in jobs if self.may_go(job)])
-        while (problem := self._no_room(needed)) is not None:
-            job = next(candidates, None)
-            if job is None:
+        candidates = [job for job in jobs if self.may_go(job)]
+        problem = self._no_room(needed)
+        if problem is not None:
+            could_go = sum(_folder_bytes(self.folder(job.id)) for job in candidates)
+            if self._no_room(needed - could_go) is not None:
                 raise problem
+        for job in candidates:
+            if self._no_room(needed) is None:
+                break
             self.delete(job)
             gone.append(job)
         return gone

@@ -15,7 +15,7 @@ import pytest
 
 from scanner.clock import VirtualClock
 from scanner.errors import StorageError
-from scanner.wire import ScanStart
+from scanner.wire import FileEntry, ScanStart
 from service.acquisition import Scan
 from service.jobs import Job, JobState, JobStore
 from service.pipe import CancelAcquire, Ended, framed, read_command
@@ -141,6 +141,16 @@ async def test_an_acknowledgement_counts_once_it_is_on_disk(bench: Bench) -> Non
         with pytest.raises(StorageError):
             await bench.pipeline.acknowledge(job)
     assert not job.acknowledged
+
+
+async def test_files_that_a_killed_daemon_deleted_are_known_to_be_gone(bench: Bench) -> None:
+    gone, kept = (Job(str(uuid.uuid4()), "", ScanStart(""), state=JobState.DONE) for _ in range(2))
+    for job in (gone, kept):
+        job.files = (FileEntry("scan.npz", 1, ""),)
+        bench.store._jobs[job.id] = job
+    bench.spool.folder(kept.id).mkdir()
+    await bench.acquiring()
+    assert (gone.deleted, kept.deleted) == (True, False)
 
 
 async def test_the_spool_is_swept_again_after_a_disk_failed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

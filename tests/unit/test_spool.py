@@ -50,6 +50,15 @@ def test_oldest_acknowledged_go_first_and_no_more_than_needed(new_spool: Callabl
     assert [job.deleted for job in jobs] == [True, True, False, False]
 
 
+def test_for_a_scan_that_cannot_fit_nothing_goes(new_spool: Callable[[Limits], Spool]) -> None:
+    spool = new_spool(Limits(bytes=4 * MB))
+    job = filled(spool, JobState.DONE, acknowledged=True)
+    with pytest.raises(StorageError, match="holds 1 MB of 4 MB and the scan needs 5 MB"):
+        spool.make_room(5 * MB, [job])
+    assert spool.folder(job.id).exists()
+    assert not job.deleted
+
+
 @pytest.mark.parametrize("state", [s for s in JobState if s not in (JobState.DONE, JobState.CANCELLED)])
 def test_a_series_that_is_not_decoded_is_never_deleted(
     new_spool: Callable[[Limits], Spool], state: JobState, clock: list[float]
