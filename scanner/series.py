@@ -1,7 +1,7 @@
 """A series: capture folders of one endless recording, one after the other, and the list of them in series.json.
 
     {"format": "fringed-series", "version": 1, "id": "...", "state": "open | complete | failed", "reason": "...",
-     "frames": 700, "captures": [{"folder": "0000", "first": 0, "frames": 256}, ...]}
+     "frames": 700, "captures": [{"folder": "000000", "first": 0, "frames": 256}, ...]}
 
 `first` is the number of a folder's first frame in the run. While a recording is open its last folder counts 0 frames.
 """
