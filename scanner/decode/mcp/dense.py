@@ -107,19 +107,19 @@ def _pieces(
                 slope = tangent[0] if tangent[0] > 0 else (row[k + 1] - row[k]) / (y[k + 1] - y[k])
                 lines = np.ceil(y[k] - reach), np.ceil(y[k])
                 n = _place(lines, size, of_column, n, begin, end)
-                _beyond(y, row, others, k, slope, figures[n - 1])
+                _beyond(y, row, others, k, slope, n - 1, figures)
             for j in range(k, last):
                 lines = np.ceil(y[j]), np.floor(y[j + 1]) + np.float32(1)
                 n = _place(lines, size, of_column, n, begin, end)
                 bend = _bend_of(y, row, j, k, last)
-                _between(y, row, others, j, tangent[j - k], tangent[j - k + 1], bend, figures[n - 1])
+                _between(y, row, others, j, (tangent[j - k], tangent[j - k + 1]), bend, n - 1, figures)
             if last > k:
                 reach = np.float32(MARGIN) * (y[last] - y[last - 1])
                 t = tangent[last - k]
                 slope = t if t > 0 else (row[last] - row[last - 1]) / (y[last] - y[last - 1])
                 lines = np.floor(y[last]) + np.float32(1), np.floor(y[last] + reach) + np.float32(1)
                 n = _place(lines, size, of_column, n, begin, end)
-                _beyond(y, row, others, last, slope, figures[n - 1])
+                _beyond(y, row, others, last, slope, n - 1, figures)
             k = last + 1
         column[of_column:n] = b
     return column[:n], begin[:n], end[:n], figures[:n]
@@ -222,12 +222,13 @@ def _between(
     row: Array,
     others: Array,
     j: int,
-    left: np.float32,
-    right: np.float32,
+    tangents: tuple[np.float32, np.float32],
     unknown: np.float32,
-    piece: Array,
+    n: int,
+    figures: Array,
 ) -> None:
-    """Figures of the piece between knots j and j + 1 (`dense_lines.FIGURES`)."""
+    """Figures of piece n, between knots j and j + 1 (`dense_lines.FIGURES`)."""
+    left, right = tangents
     gap = y[j + 1] - y[j]
     rise = row[j + 1] - row[j]
     slope = rise / gap
@@ -235,25 +236,25 @@ def _between(
         left = right = slope
     else:
         unknown *= BEND_LEFT
-    piece[0], piece[1] = y[j], np.float32(1) / gap
-    piece[2], piece[3] = row[j], rise
-    piece[4], piece[5] = (left - slope) * gap, (right - slope) * gap
-    piece[6], piece[7], piece[8] = others[j, 0], others[j + 1, 0], unknown
-    piece[9] = min(others[j, 1], others[j + 1, 1])
-    piece[10], piece[11] = others[j, 2], others[j + 1, 2]
-    piece[12], piece[13] = others[j, 3], others[j + 1, 3]
+    figures[n, 0], figures[n, 1] = y[j], np.float32(1) / gap
+    figures[n, 2], figures[n, 3] = row[j], rise
+    figures[n, 4], figures[n, 5] = (left - slope) * gap, (right - slope) * gap
+    figures[n, 6], figures[n, 7], figures[n, 8] = others[j, 0], others[j + 1, 0], unknown
+    figures[n, 9] = min(others[j, 1], others[j + 1, 1])
+    figures[n, 10], figures[n, 11] = others[j, 2], others[j + 1, 2]
+    figures[n, 12], figures[n, 13] = others[j, 3], others[j + 1, 3]
 
 
 @kernel
-def _beyond(y: Array, row: Array, others: Array, k: int, slope: np.float32, piece: Array) -> None:
-    """Figures of the piece beyond knot k, at a run's end: extrapolated, two thirds as sure and twice as uncertain."""
-    piece[0], piece[1] = y[k], np.float32(1)
-    piece[2], piece[3], piece[4], piece[5] = row[k], slope, np.float32(0), np.float32(0)
-    piece[6] = piece[7] = np.float32(2) * others[k, 0]
-    piece[8] = np.float32(0)
-    piece[9] = np.float32(0.67) * others[k, 1]
-    piece[10] = piece[11] = others[k, 2]
-    piece[12] = piece[13] = others[k, 3]
+def _beyond(y: Array, row: Array, others: Array, k: int, slope: np.float32, n: int, figures: Array) -> None:
+    """Figures of piece n, beyond knot k, at a run's end: extrapolated, two thirds as sure and twice as uncertain."""
+    figures[n, 0], figures[n, 1] = y[k], np.float32(1)
+    figures[n, 2], figures[n, 3], figures[n, 4], figures[n, 5] = row[k], slope, np.float32(0), np.float32(0)
+    figures[n, 6] = figures[n, 7] = np.float32(2) * others[k, 0]
+    figures[n, 8] = np.float32(0)
+    figures[n, 9] = np.float32(0.67) * others[k, 1]
+    figures[n, 10] = figures[n, 11] = others[k, 2]
+    figures[n, 12] = figures[n, 13] = others[k, 3]
 
 
 def stripe_map(y: Array, stripe: Ints, chains: Chains, shape: tuple[int, int]) -> NDArray[np.int16]:
