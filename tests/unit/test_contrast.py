@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scanner.contrast import BLUR_VARIANCE_PX2, widen_at_edges
+from scanner.contrast import BLUR_VARIANCE_PX2, blur_variance_of, widen_at_edges
 from scanner.decode import decoder_for
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
 from scanner.scan import Scan, build_scan
@@ -84,3 +84,20 @@ def test_points_at_a_printed_edge_lie_within_what_is_stated(axis, rig_of, scene_
     assert shares[0][1] < 0.9
     assert 0.60 < shares[1][0] < 0.80
     assert 0.92 < shares[1][1] < 0.985
+
+
+@pytest.mark.parametrize("blur_px", [0.5, 0.8, 1.3])
+def test_a_textured_scene_tells_the_cameras_blur(blur_px):
+    """A bent board with print on it: the pull is what a Gaussian's first moment makes of a slope."""
+    random = np.random.default_rng(7)
+    y, x = np.mgrid[:900, :1200].astype(np.float32)
+    rows = (0.8 * y + 12 * np.sin(x / 90)).astype(np.float32)
+    print_ = np.where((x // 9 + y // 9) % 2, 0.9, 0.15).astype(np.float32)
+    seen = cv2.GaussianBlur(print_, (0, 0), blur_px)
+    pulled = cv2.GaussianBlur(print_ * rows, (0, 0), blur_px) / seen
+    values = pulled + random.normal(0, 0.03, rows.shape).astype(np.float32)
+    sigma = np.full_like(values, 0.03)
+    found = blur_variance_of(values, sigma, 80 * seen)
+    assert np.sqrt(found) == pytest.approx(blur_px, rel=0.2)
+    assert blur_variance_of(rows + random.normal(0, 0.03, rows.shape), sigma, 80 * np.ones_like(seen)) is None
+    assert blur_variance_of(values[:200, :200], sigma[:200, :200], seen[:200, :200]) is None
