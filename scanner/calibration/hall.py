@@ -116,6 +116,40 @@ def decompose(matrix: Array) -> Decomposed:
     return Decomposed(upper / upper[2, 2], rotation, translation)
 
 
+def focal_spread(matrix: Array, points: Array, pixels: Array) -> float:
+    """1-sigma of the focal length as a share of it, from what the fit leaves; by first-order propagation.
+
+    Args:
+        matrix: (3, 4), fitted.
+        points: (N, 3) mm, the points it was fitted to; more than six.
+        pixels: (N, 2) px.
+
+    Returns:
+        Infinite where the points do not fix it.
+    """
+    free = 2 * len(points) - 11
+    left = float(((project_hall(matrix, points) - pixels) ** 2).sum()) / max(free, 1)
+    whole = matrix.ravel()[:11]
+
+    def values(numbers: Array) -> tuple[Array, float]:
+        changed = np.append(numbers, 1.0).reshape(3, 4)
+        parts = decompose(changed).matrix
+        return project_hall(changed, points).ravel(), float(np.log(abs(parts[0, 0] * parts[1, 1])) / 2)
+
+    seen, focal = values(whole)
+    by, slope = np.empty((len(seen), 11)), np.empty(11)
+    for k in range(11):
+        step = np.zeros(11)
+        step[k] = 1e-6 * max(abs(whole[k]), 1e-9)
+        ahead = values(whole + step)
+        by[:, k], slope[k] = (ahead[0] - seen) / step[k], (ahead[1] - focal) / step[k]
+    scale = np.linalg.norm(by, axis=0)  # columns differ by many orders: px, 1, 1 / mm
+    if not (np.isfinite(by).all() and (scale > 0).all()):
+        return float("inf")
+    covariance = np.linalg.pinv((by / scale).T @ (by / scale))
+    return float(np.sqrt(left * (slope / scale) @ covariance @ (slope / scale)))
+
+
 def _equation(plane: Array) -> tuple[Array, Array]:
     """(N, 3) normals and (N, 1) right-hand sides of planes (N, 4)."""
     return plane[:, :3], -plane[:, 3:]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from scanner.calibration.calibration_file import calibration_dict
-from scanner.calibration.hall import decompose, hall_matrix, project_hall, triangulate_hall
+from scanner.calibration.hall import decompose, focal_spread, hall_matrix, project_hall, triangulate_hall
 from scanner.calibration.observe import LeftOut, Observation
 from scanner.calibration.solve import SolveOptions, solve
 from scanner.calibration.solve_hall import solve_hall
@@ -138,6 +138,22 @@ def test_too_few_discs_and_no_capture_are_refused(wedge: Target) -> None:
         solve_hall(wedge, [few])
     with pytest.raises(CalibrationError, match="too dark"):
         solve_hall(wedge, [], None, [LeftOut("a", "too dark")])
+
+
+def test_a_target_that_is_nearly_flat_is_refused(wedge: Target) -> None:
+    shallow = replace(wedge, points=wedge.points * (1.0, 1.0, 0.04))
+    with pytest.raises(CalibrationError, match="depth is too small for the Hall model"):
+        solve_hall(shallow, seen(PLAIN, shallow))
+
+
+def test_focal_length_scatters_as_it_says(wedge: Target) -> None:
+    found, stated = [], []
+    for seed in range(30):
+        view = view_of(RIG, POSE, "wedge", target=wedge, noise=(0.05, 0.01), seed=seed)
+        matrix = hall_matrix(wedge.points, view.camera)
+        found.append(np.sqrt(np.prod(np.diag(decompose(matrix).matrix)[:2])))
+        stated.append(focal_spread(matrix, wedge.points, view.camera))
+    assert np.std(found) / np.mean(found) == pytest.approx(np.median(stated), rel=0.4)
 
 
 def test_target_file_of_the_other_hand_is_refused(wedge: Target) -> None:
