@@ -36,8 +36,8 @@ MOST_RMS_SHARE = 0.002
 """Of the picture's width that residuals may have: beyond, points and model do not belong together."""
 
 MOST_FOCAL_SPREAD = MOST_RELATIVE_SIGMA
-"""1-sigma of a focal length, as a share, that a target in space may leave. What a lens's distortion adds is no noise and
-errs by several times as much. The dissertation's wedge leaves 0.05 % on casey2011 and 0.5 % through distortion."""
+"""1-sigma of a focal length, as a share, that a target in space may leave. What a lens's distortion adds is no noise,
+and errs by several times as much. The dissertation's wedge leaves 0.05 % on casey2011, 0.5 % where lenses distort."""
 
 
 @dataclass(frozen=True, eq=False)
