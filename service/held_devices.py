@@ -28,6 +28,9 @@ LOOK_NS = 500_000_000
 AGAIN_NS = (250_000_000, 2_000_000_000)
 """First and longest pause between two tries: what is back is in use within five seconds, its own opening included"""
 
+STEADY_NS = 10_000_000_000
+"""Devices that fail sooner after they were opened are not opened at once again and again"""
+
 _log = logging.getLogger(__name__)
 Say = Callable[[Report], None]
 
@@ -42,6 +45,7 @@ class HeldDevices:
         self._opened: OpenRig | None = None
         self._due_ns: int | None = None
         self._pause_ns = AGAIN_NS[0]
+        self._since_ns = clock.now_ns()
 
     @property
     def opened(self) -> OpenRig | None:
@@ -76,8 +80,9 @@ class HeldDevices:
         self.close()
         _let_go(error)
         self._say(DeviceFault(error_body(error)))
-        self._pause_ns = AGAIN_NS[0]
-        self._due_ns = self._clock.now_ns() + self._pause_ns
+        if self._clock.now_ns() - self._since_ns > STEADY_NS:
+            self._pause_ns = AGAIN_NS[0]
+        self._put_off()
 
     def pause_s(self) -> float | None:
         """Time until `mind` has something to do; None: never."""
@@ -96,8 +101,7 @@ class HeldDevices:
             self._hold()
         except ScannerError as error:
             _log.debug("not yet: %s", error)
-            self._due_ns = self._clock.now_ns() + self._pause_ns
-            self._pause_ns = min(2 * self._pause_ns, AGAIN_NS[1])
+            self._put_off()
 
     def close(self) -> None:
         """Give the devices back. May be called twice."""
@@ -112,8 +116,13 @@ class HeldDevices:
 
     def _hold(self) -> None:
         self._opened = open_rig(self._settings, self._clock)
+        self._since_ns = self._clock.now_ns()
         self._rest()
         self._say(described(self._opened))
+
+    def _put_off(self) -> None:
+        self._due_ns = self._clock.now_ns() + self._pause_ns
+        self._pause_ns = min(2 * self._pause_ns, AGAIN_NS[1])
 
     def _look(self) -> None:
         try:

@@ -117,6 +117,21 @@ def test_a_loss_in_a_scan_is_told_and_nothing_is_left_open(
     assert devices.opened is not None
 
 
+def test_devices_that_fail_again_and_again_are_tried_ever_less_often(held: tuple[HeldDevices, VirtualClock]) -> None:
+    devices, clock = held
+    pauses = []
+    for _ in range(6):
+        devices.lose(DeviceLost("no good", device="camera"))
+        pauses.append(devices.pause_s())
+        clock.sleep_until(clock.now_ns() + 2_000_000_000)
+        devices.mind()
+        assert devices.opened is not None
+    assert pauses == [0.25, 0.5, 1, 2, 2, 2]
+    _idle(devices, clock, 11)
+    devices.lose(DeviceLost("once more", device="camera"))
+    assert devices.pause_s() == 0.25
+
+
 def test_devices_that_cannot_say_are_left_alone(said: list[Report]) -> None:
     devices = HeldDevices(VirtualClock(), said.append)
     devices.open(simulated_rig(DEVICE).model_dump(mode="json"))
