@@ -60,19 +60,17 @@ def widen_at_edges(scan: Scan, phase_axis: str, blur_variance_px2: float | None 
     """
     measured: float | None = None
     wider: dict[str, Map] = {}
-    factor: Map | None = None
     for axis, name in (("y", "rows"), ("x", "columns")):
         values, sigma = getattr(scan, name), getattr(scan, f"sigma_{name}")
         if values is not None and sigma is not None:
             if blur_variance_px2 is None and measured is None:
                 measured = blur_variance_of(values, sigma, scan.modulation)
             blur = blur_variance_px2 or measured or BLUR_VARIANCE_PX2
-            wider[f"sigma_{name}"] = _widened(values, sigma, scan.modulation, blur)
-            if factor is None or axis == phase_axis:
-                factor = wider[f"sigma_{name}"] / sigma
-    if scan.sigma_z is not None and factor is not None:
-        wider["sigma_z"] = scan.sigma_z * factor
-    told = {f"{name}_{'mm' if name == 'sigma_z' else 'px'}": spread(values) for name, values in wider.items()}
+            # Depth comes from one axis: from the only one, or from the one that changes with it.
+            depth = scan.sigma_z if axis == phase_axis or scan.rows is None or scan.columns is None else None
+            wider[f"sigma_{name}"], scaled = _widened(values, sigma, scan.modulation, blur, depth)
+            wider |= {} if scaled is None else {"sigma_z": scaled}
+    told = {f"{name}_{'mm' if name == 'sigma_z' else 'px'}": spread(v[::2, ::2]) for name, v in wider.items()}
     return replace(
         scan,
         report={**scan.report, **told, "camera_blur_px": None if measured is None else math.sqrt(measured)},
@@ -126,21 +124,24 @@ def _pulls(values: Map, sigma: Map, modulation: Map) -> tuple[Map, Map, Map]:
 def warm_up() -> None:
     """Compile the kernel."""
     one = np.ones((3, 3), np.float32)
-    _widen(one, one, one, np.float32(1), 0, 3, one.copy())
+    _widen(one, one, one, np.float32(1), one, 0, 3, one.copy(), one.copy())
 
 
-def _widened(values: Map, sigma: Map, modulation: Map, variance: float) -> Map:
+def _widened(values: Map, sigma: Map, modulation: Map, variance: float, depth: Map | None) -> tuple[Map, Map | None]:
+    """Sigmas of coordinates, and those of depth grown by the same factor."""
     height, width = values.shape
     wider = np.empty_like(sigma)
-    widen = partial(_widen, values, sigma, modulation, np.float32(variance))
+    no_depth = np.empty((0, 0), np.float32)
+    scaled = no_depth if depth is None else np.empty_like(depth)
+    widen = partial(_widen, values, sigma, modulation, np.float32(variance), no_depth if depth is None else depth)
     threads = threads_to_use()
 
     def rows(begin: int, end: int) -> None:
         # Whole rows: the one that a strip begins in the middle of is the next strip's.
-        widen(-(-begin // width), -(-end // width), wider)
+        widen(-(-begin // width), -(-end // width), wider, scaled)
 
     in_strips(rows, height * width, threads)
-    return wider
+    return wider, None if depth is None else scaled
 
 
 @contracting_kernel
@@ -149,11 +150,13 @@ def _widen(
     sigma: NDArray[np.float32],
     modulation: NDArray[np.float32],
     variance: np.float32,
+    depth: NDArray[np.float32],
     begin: int,
     end: int,
     wider: NDArray[np.float32],
+    scaled: NDArray[np.float32],
 ) -> None:
-    """Rows begin .. end - 1 of (H, W) maps; wider is written."""
+    """Rows begin .. end - 1 of (H, W) maps; wider is written, and scaled from depth, which may be (0, 0)."""
     height, width = values.shape
     pull = np.empty(width, np.float32)
     for y in range(begin, end):
@@ -174,6 +177,9 @@ def _widen(
         for x in range(width):
             moved = variance * pull[x]
             wider[y, x] = np.sqrt(sigma[y, x] * sigma[y, x] + moved * moved)
+        if depth.size > 0:
+            for x in range(width):
+                scaled[y, x] = depth[y, x] * (wider[y, x] / sigma[y, x])
 
 
 @contracting_kernel

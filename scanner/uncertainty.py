@@ -24,6 +24,9 @@ from scanner.scan import Scan
 COVERAGE_FACTOR = 2.0
 """Of the expanded uncertainty: 95 % of a normal error."""
 
+MEDIAN_OF = 20_000
+"""Points of a scan that are asked"""
+
 Kind = Literal["random", "systematic"]
 
 
@@ -96,8 +99,9 @@ def budget_of(
     sigma_px = scan.sigma_rows if axis == "y" else scan.sigma_columns
     if scan.xyz is None or scan.sigma_z is None or sigma_px is None:
         return None
-    some = scan.xyz[::4, ::4] if scan.xyz.size > 300_000 else scan.xyz
-    depth, px, mm = some[..., 2], _like(sigma_px, some), _like(scan.sigma_z, some)
+    # Medians of some ten thousand points are as good as those of all.
+    every = max(1, int(math.sqrt(scan.sigma_z.size / MEDIAN_OF)))
+    depth, px, mm = scan.xyz[::every, ::every, 2], sigma_px[::every, ::every], scan.sigma_z[::every, ::every]
     known = np.isfinite(depth) & np.isfinite(mm) & (px > 0)
     if not known.any():
         return None
@@ -112,10 +116,6 @@ def budget_of(
     contributions = [_in_mm(cause, per_px) for cause in causes]
     contributions.insert(1, _calibration(scan, calibration, axis))
     return Budget(float(np.median(depth[known])), tuple(contributions))
-
-
-def _like(values: Any, some: Any) -> Any:
-    return values if values.shape == some.shape[:2] else values[::4, ::4]
 
 
 def _fringes(sequence: PatternSequence) -> PmpPattern | None:
