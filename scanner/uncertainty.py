@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -18,7 +19,8 @@ from numpy.typing import NDArray
 from scanner.calibration_spread import depth_spread
 from scanner.decode.pmp_frames import design_matrix
 from scanner.geometry import Calibration
-from scanner.patterns import Axis, CompositePattern, GrayPmpPattern, PatternSequence, PmpPattern
+from scanner.patterns import Axis, CompositePattern, GrayPmpPattern, PatternSequence, PmpPattern, ProjectorSize
+from scanner.patterns.sequence import Precorrection
 from scanner.scan import Scan
 
 COVERAGE_FACTOR = 2.0
@@ -166,11 +168,18 @@ def grey_level_px(sequence: PatternSequence, axis: Axis) -> float:
     pattern = _fringes(sequence)
     if pattern is None:
         raise TypeError("grey levels of fringes")
+    return _grey_level_px(pattern, sequence.projector, sequence.precorrection, axis)
+
+
+@lru_cache(maxsize=8)
+def _grey_level_px(
+    pattern: PmpPattern, projector: ProjectorSize, correction: Precorrection | None, axis: Axis
+) -> float:
+    # A rig projects the same images again and again.
     finest = max((s for s in pattern.sets() if s.axis == axis), key=lambda s: s.frequency)
-    along = sequence.projector.along(axis)
-    lines = [_line(pattern.fringe(finest.first + n, sequence.projector), axis) for n in range(finest.shifts)]
+    along = projector.along(axis)
+    lines = [_line(pattern.fringe(finest.first + n, projector), axis) for n in range(finest.shifts)]
     meant: NDArray[np.float32] = np.stack(lines).astype(np.float32)
-    correction = sequence.precorrection
     if correction is None:
         shown = np.rint(meant * 255) / 255
     else:
