@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scanner.decode.mcp import carriers, description, hmm, linking, stripes
+from scanner.decode.mcp import carriers, decision, description, emissions, hmm, linking, stripes
 from scanner.decode.mcp.model import PatternModel
 from scanner.patterns import McpPattern, ProjectorSize
 
@@ -78,3 +78,10 @@ def test_carriers_of_one_set_are_not_taken_for_another_where_the_magnification_d
     assert found.drift_x == pytest.approx(0.1, abs=0.031)
     assert found.drift_y == pytest.approx(-0.12, abs=0.031)
     assert np.prod(found.contrast) ** 0.25 > 1.25
+
+
+def test_a_peak_whose_carriers_were_hardly_measured_needs_more_to_be_decided():
+    sigma = np.float32([0.005, 0.03, 0.05, 10.0])[:, None] * np.ones((1, 4), np.float32)
+    seen = emissions.Amplitudes(np.zeros((4, 4), np.float32), sigma, np.ones(4, np.float32))
+    for model in (OWN, PUBLISHED):  # the weakest carrier is a quarter of its stripe's light in both
+        np.testing.assert_allclose(decision.confidence_needed(seen, model), [0.9, 0.9, 0.99, 0.99], rtol=1e-6)
