@@ -1,6 +1,7 @@
 """The daemon's side of the devices process: starts it, asks for scans, and gives it up when it hangs or dies.
 
 closed --open--> opening --opened--> idle --acquire--> scanning --ended--> idle
+idle --fault--> lost, and the process opens them again by itself --opened--> idle
 any --process gone, or silent for too long (it is killed)--> closed; the next need opens a fresh one
 """
 
