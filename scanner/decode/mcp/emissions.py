@@ -247,33 +247,46 @@ def refined_modulation(seen: Amplitudes, model: PatternModel, posterior: Array, 
     """
     modulation = previous.copy()
     floor = np.full(model.channels, 0.02, np.float32)
-    strength = np.zeros((len(posterior), 2, model.channels), np.float32)
-    _expected(posterior, np.ascontiguousarray(np.stack([model.ratio, model.ratio > 0], axis=1), np.float32), strength)
-    expected, on = strength[:, 0], strength[:, 1]
+    sums, off, count = (
+        np.zeros((2, model.channels)),
+        np.empty(seen.ratio.T.shape, np.float32),
+        np.zeros(model.channels, int),
+    )
+    _carried(posterior, model.ratio, seen.ratio, sums, off, count)
     for i in range(model.channels):
         # Where carried for certain, the expected ratio is the pattern's own: least squares through the origin.
-        square = float((expected[:, i] ** 2).sum())
+        square, product = (float(part) for part in sums[:, i])
         if square > 1e-3 * len(posterior) * float(model.ratio[:, i].max()) ** 2:
-            product = float((expected[:, i] * seen.ratio[:, i]).sum())
             modulation[i] = np.clip(product / square, MODULATION_FLOOR, MODULATION_TOP)
-        off = seen.ratio[on[:, i] < 0.1, i]
-        if len(off) > 10:
+        if count[i] > 10:
             # Rayleigh: the median is 1.177 sigma. What texture adds here and there is in each fit's own residual.
-            floor[i] = np.clip(median(off) / 1.177, 0.008, 0.1)
+            floor[i] = np.clip(median(off[i, : count[i]]) / 1.177, 0.008, 0.1)
     return modulation, floor
 
 
 @kernel
-def _expected(posterior: Array, table: Array, result: Array) -> None:
-    """result[k] = sum over states of posterior[k, s] table[s]; most states have no share worth the sum."""
-    count, states = posterior.shape
-    for k in range(count):
+def _carried(
+    posterior: Array, own: Array, seen: Array, sums: NDArray[np.float64], off: Array, count: NDArray[np.int64]
+) -> None:
+    """Of each channel: sums of expected x expected and expected x seen, and what is seen where it is switched off."""
+    peaks, states = posterior.shape
+    channels = own.shape[1]
+    expected, on = np.empty(channels, np.float32), np.empty(channels, np.float32)
+    for k in range(peaks):
+        expected[:] = 0
+        on[:] = 0
         for s in range(states):
             share = posterior[k, s]
-            if share > np.float32(1e-4):
-                for m in range(table.shape[1]):
-                    for i in range(table.shape[2]):
-                        result[k, m, i] += share * table[s, m, i]
+            if share > np.float32(1e-4):  # most states have no share worth the sum
+                for i in range(channels):
+                    expected[i] += share * own[s, i]
+                    on[i] += share if own[s, i] > 0 else np.float32(0)
+        for i in range(channels):
+            sums[0, i] += expected[i] * expected[i]
+            sums[1, i] += expected[i] * seen[k, i]
+            if on[i] < np.float32(0.1):
+                off[i, count[i]] = seen[k, i]
+                count[i] += 1
 
 
 def log_likelihood(seen: Amplitudes, model: PatternModel, modulation: Array, floor: Array) -> tuple[Array, Array]:
