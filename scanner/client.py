@@ -13,7 +13,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -42,6 +42,7 @@ from scanner.session import (
 from scanner.wire import DEFAULT_ENDPOINT, WELCOME, Event
 
 if TYPE_CHECKING:
+    from scanner.camera_picture import CameraPicture
     from scanner.live import LiveFrame
     from scanner.scan import Scan
 
@@ -246,6 +247,28 @@ class Client:
     def live_status(self) -> dict[str, Any] | None:
         """The live run under way, or the last one: state, counts, rates, latency; None where there was none."""
         return self.call("live.status")["run"]  # type: ignore[no-any-return]
+
+    def previews(self, **params: Any) -> Generator[CameraPicture, None, None]:
+        """Pictures of the preview, the newest each time, until the generator is closed; params: see `preview.start`.
+
+        Raises:
+            ScannerError: why there are none, as its class.
+        """
+        from scanner.camera_picture import CameraPicture  # noqa: PLC0415
+        from scanner.live import QUIET_S  # noqa: PLC0415
+
+        pictures = conflated(self._context.socket(zmq.SUB), self.preview_start(**params))
+        last = None
+        try:
+            while True:
+                if pictures.poll(int(2e3 * QUIET_S)):
+                    yield (last := CameraPicture.of(pictures.recv(), last))
+                else:
+                    self.preview_start(**params)  # once more: after a lost camera it has ended; or it says why not
+        finally:
+            pictures.close()
+            with suppress(ScannerError):
+                self.preview_stop()
 
     def preview_start(self, **params: Any) -> str:
         """Start the preview; returns the endpoint to subscribe to (ZMQ_SUB with ZMQ_CONFLATE)."""

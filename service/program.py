@@ -27,6 +27,7 @@ from service.commands import (
     doctor,
     live,
     patterns,
+    preview,
     scan,
     simulate,
     status,
@@ -47,6 +48,7 @@ app = typer.Typer(
 )
 app.command()(scan.scan)
 app.command()(live.live)
+app.command()(preview.preview)
 app.command()(decode.decode)
 app.command()(audit.audit)
 app.command()(patterns.patterns)

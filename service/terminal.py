@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -93,6 +94,25 @@ def progress_lines() -> Iterator[ProgressLines]:
         lines = ProgressLines(progress)
         yield lines
         lines.end()
+
+
+@contextmanager
+def status_line() -> Iterator[Callable[[str], None]]:
+    """Writes a line that changes: in place on a terminal, one below the other elsewhere. On standard error."""
+    terminal = sys.stderr.isatty()
+
+    def write(words: str) -> None:
+        if terminal:
+            width = shutil.get_terminal_size().columns
+            print(f"\r\x1b[K{words[: width - 1]}", end="", file=sys.stderr, flush=True)
+        else:
+            print(words, file=sys.stderr, flush=True)
+
+    try:
+        yield write
+    finally:
+        if terminal:
+            print(file=sys.stderr)
 
 
 def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import shutil
-import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -31,7 +30,7 @@ from service.commands.options import (
     output_path,
 )
 from service.commands.scan import exposure_given, rig_daemon
-from service.terminal import print_error, print_facts, print_json, progress_lines
+from service.terminal import print_error, print_facts, print_json, progress_lines, status_line
 
 if TYPE_CHECKING:
     from scanner.client import Client
@@ -135,7 +134,7 @@ def _live(
         job_id = client.live_start(**params)["id"]
         watching = _Watching(client, picture, begun)
         try:
-            with suppress(KeyboardInterrupt), _line() as line:  # Ctrl-C is how a run is ended
+            with suppress(KeyboardInterrupt), status_line() as line:  # Ctrl-C is how a run is ended
                 watching.all(client.live_frames(job_id), line)
         finally:
             begun()
@@ -196,25 +195,6 @@ def figures(live: Mapping[str, Any]) -> str:
         f"({live['problem']})" if live["problem"] else "",
     ]
     return "  ".join(part for part in parts if part)
-
-
-@contextmanager
-def _line() -> Iterator[Any]:
-    """Writes the line: in place on a terminal, one below the other elsewhere. On standard error."""
-    terminal = sys.stderr.isatty()
-
-    def write(words: str) -> None:
-        if terminal:
-            width = shutil.get_terminal_size().columns
-            print(f"\r\x1b[K{words[: width - 1]}", end="", file=sys.stderr, flush=True)
-        else:
-            print(words, file=sys.stderr, flush=True)
-
-    try:
-        yield write
-    finally:
-        if terminal:
-            print(file=sys.stderr)
 
 
 def _draw(path: Path, frame: LiveFrame, caption: str) -> None:

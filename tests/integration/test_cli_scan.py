@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 
 from scanner.capture import Capture
@@ -162,3 +163,16 @@ def test_a_running_daemon_is_asked_for_scans(tmp_path: Path) -> None:
         daemon.send_signal(signal.SIGTERM)
         daemon.communicate(timeout=PATIENCE_S)
     assert daemon.returncode == 0
+
+
+def test_preview_writes_a_picture_and_tells_how_bright_it_is(tmp_path: Path) -> None:
+    file = tmp_path / "seen.png"
+    ran = fringed("preview", "--rig", "simulated:quick/board", "--seconds", "0.2", "-o", file, "--json")
+    assert ran.returncode == 0, ran.stderr
+    told = json.loads(ran.stdout)
+    assert told["pictures"] > 0
+    assert 0.2 < told["mean"] < told["bright"] < 1
+    assert cv2.imread(str(file), cv2.IMREAD_UNCHANGED).shape == (240, 320)
+    assert "sharpness" in ran.stderr
+    refused = fringed("preview", "-o", tmp_path / "seen.gif")
+    assert (refused.returncode, "png or jpg" in refused.stderr) == (2, True)
