@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scanner.decode import Decoded, Map, Reason
 from scanner.decode.addresses import addresses_of, aligned_rows
 from scanner.decode.frames import FrameCheck
-from scanner.decode.graycode_kernels import BOTH, INVERSE, PLAIN, decode_codes, gather
+from scanner.decode.graycode_bits import BOTH, INVERSE, PLAIN
+from scanner.decode.graycode_kernels import decode_codes, gather
 from scanner.decode.noise import ROUNDING_VARIANCE, default_noise
 from scanner.decode.reasons import REASONS
 from scanner.decode.runs import runs_of

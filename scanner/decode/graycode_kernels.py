@@ -12,14 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.addresses import aligned_rows, expect_pixels, pixels_at
+from scanner.decode.addresses import aligned_rows, pixels_at
+from scanner.decode.graycode_bits import BOTH, read_bits, value_and_spread
 from scanner.decode.reasons import count_reasons
 from scanner.kernel import contracting_kernel
 
 TILE = 2048
-
-PLAIN, INVERSE, BOTH = 0, 1, 2
-"""Which images of a bit there are."""
 
 BOTH_VARIANCE, SINGLE_VARIANCE = 2.0, 6.0
 """Variance of an image less its inverse, and of twice an image less white and black, in units of one sample's."""
@@ -89,7 +87,6 @@ def decode_codes(
     why = np.empty(TILE, np.uint8)
     for at in range(begin, end, TILE):
         size = min(TILE, end - at)
-        _expect(addresses, at + size, size, like)
         if levels[0] != 0:
             _levels(pixels_at(levels[0], at, size, like), pixels_at(levels[1], at, size, like), size, light, dark)
         else:
@@ -102,8 +99,8 @@ def decode_codes(
         for i in range(size):
             kept[i] = _F1
         for axis in range(axes):
-            _read(addresses[axis], kinds[axis], levels, at, size, like, thresholds, limits, words, nearest)
-            _value_and_spread(words, gray, size, value, spread)
+            read_bits(addresses[axis], kinds[axis], levels, at, size, like, thresholds, limits, words, nearest)
+            value_and_spread(words, gray, size, value, spread)
             for i in range(size):
                 wrong[i] = _F0
             pairs = 0
@@ -138,15 +135,6 @@ def gather(
 
 
 # --- levels -----------------------------------------------------------------------------------------------------------
-
-
-@contracting_kernel
-def _expect(addresses: NDArray[np.intp], at: int, size: int, like: NDArray[Any]) -> None:
-    for axis in range(addresses.shape[0]):
-        for bit in range(addresses.shape[1]):
-            for image in range(2):
-                if addresses[axis, bit, image] != 0:
-                    expect_pixels(addresses[axis, bit, image], at, size, like)
 
 
 @contracting_kernel
@@ -218,133 +206,6 @@ def _contrast(
         least_share = max(share * contrast[i], _F0)
         thresholds[0, i] = np.int32(min(max(least_share, np.sqrt(decisive2 * _BOTH * variance[i])), top))
         thresholds[1, i] = np.int32(min(max(least_share, np.sqrt(decisive2 * _SINGLE * variance[i])), top))
-
-
-# --- bits -------------------------------------------------------------------------------------------------------------
-
-
-@contracting_kernel
-def _read(
-    addresses: NDArray[np.intp],
-    kinds: NDArray[np.int64],
-    levels: NDArray[np.intp],
-    at: int,
-    size: int,
-    like: NDArray[Any],
-    thresholds: NDArray[Any],
-    limits: NDArray[np.float32],
-    words: NDArray[np.uint16],
-    nearest: NDArray[Any],
-) -> None:
-    """words[0]: the bits; words[1]: which are open. nearest: least and second least difference of decided bits, of
-    pairs [0, 1] and of single images [2, 3]."""
-    top = int(limits[6])
-    for i in range(size):
-        words[0, i] = 0
-        words[1, i] = 0
-        nearest[0, i] = top
-        nearest[1, i] = top
-        nearest[2, i] = top
-        nearest[3, i] = top
-    for bit in range(kinds.size):
-        if kinds[bit] == BOTH:
-            _read_pair(
-                pixels_at(addresses[bit, 0], at, size, like), pixels_at(addresses[bit, 1], at, size, like),
-                thresholds[0], top, size, words[0], words[1], nearest[0], nearest[1],
-            )  # fmt: skip
-        else:
-            image = 0 if kinds[bit] == PLAIN else 1
-            _read_single(
-                pixels_at(addresses[bit, image], at, size, like), kinds[bit] == INVERSE,
-                pixels_at(levels[0], at, size, like), pixels_at(levels[1], at, size, like),
-                thresholds[1], top, size, words[0], words[1], nearest[2], nearest[3],
-            )  # fmt: skip
-
-
-@contracting_kernel
-def _read_pair(
-    image: NDArray[Any],
-    inverse: NDArray[Any],
-    threshold: NDArray[Any],
-    top: int,
-    size: int,
-    word: NDArray[np.uint16],
-    unsure: NDArray[np.uint16],
-    nearest: NDArray[Any],
-    second: NDArray[Any],
-) -> None:
-    for i in range(size):
-        one, two = image[i], inverse[i]
-        high, low = max(one, two), min(one, two)
-        difference = high - low
-        decided = difference > threshold[i]
-        margin = difference if decided else top
-        word[i] = word[i] << 1 | (one > two)
-        unsure[i] = unsure[i] << 1 | (not decided)
-        second[i] = min(second[i], max(nearest[i], margin))
-        nearest[i] = min(nearest[i], margin)
-
-
-@contracting_kernel
-def _read_single(
-    image: NDArray[Any],
-    inverted: bool,
-    white: NDArray[Any],
-    black: NDArray[Any],
-    threshold: NDArray[Any],
-    top: int,
-    size: int,
-    word: NDArray[np.uint16],
-    unsure: NDArray[np.uint16],
-    nearest: NDArray[Any],
-    second: NDArray[Any],
-) -> None:
-    for i in range(size):
-        both = np.int32(white[i]) + np.int32(black[i])
-        twice = 2 * np.int32(image[i])
-        difference = min(abs(twice - both), top)
-        decided = difference > threshold[i]
-        margin = difference if decided else top
-        bright = twice < both if inverted else twice > both
-        word[i] = word[i] << 1 | bright
-        unsure[i] = unsure[i] << 1 | (not decided)
-        second[i] = min(second[i], max(nearest[i], margin))
-        nearest[i] = min(nearest[i], margin)
-
-
-@contracting_kernel
-def _value_and_spread(
-    words: NDArray[np.uint16], gray: bool, size: int, value: NDArray[np.float32], spread: NDArray[np.float32]
-) -> None:
-    """The cell that the word names, and the largest distance in cells to what it means with its open bits turned.
-
-    More than two open bits give a spread beyond any limit.
-    """
-    one = np.uint16(1)
-    for i in range(size):
-        open_bits = words[1, i]
-        high = np.uint16(open_bits & np.uint16(open_bits - one))
-        # words[2]: with the least significant open bit turned; [3]: with the next one, too.
-        words[2, i] = words[0, i] ^ (open_bits ^ high)
-        words[3, i] = words[0, i] ^ open_bits
-        words[1, i] = high
-    if gray:
-        for w in (0, 2, 3):
-            word = words[w]
-            for i in range(size):
-                v = word[i]
-                v = np.uint16(v ^ v >> np.uint16(8))
-                v = np.uint16(v ^ v >> np.uint16(4))
-                v = np.uint16(v ^ v >> np.uint16(2))
-                word[i] = np.uint16(v ^ v >> one)
-    for i in range(size):
-        here, low, both = np.int32(words[0, i]), np.int32(words[2, i]), np.int32(words[3, i])
-        rest = np.int32(words[1, i])
-        # Turning a bit of a Gray word turns all bits of the value below it: values are linear in words.
-        alone = here ^ low ^ both
-        widest = max(abs(low - here), abs(both - here), abs(alone - here))
-        value[i] = np.float32(here)
-        spread[i] = np.float32(widest) if rest & (rest - 1) == 0 else np.float32(1e6)
 
 
 # --- verdicts ---------------------------------------------------------------------------------------------------------
