@@ -79,7 +79,7 @@ install_packages() {
     [ "$(id -u)" = 0 ] || as_root=(sudo)
     say "installing distribution packages: $missing"
     # shellcheck disable=SC2086  # a list of words
-    ${as_root[@]+"${as_root[@]}"} env DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends $missing >&2 ||
+    ${as_root[@]+"${as_root[@]}"} timeout 600 env DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends $missing >&2 ||
         cannot "the packages could not be installed. Type, as root:" \
             "    apt-get update && apt-get install --no-install-recommends $missing" "then this command again."
 }
