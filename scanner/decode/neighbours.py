@@ -52,6 +52,12 @@ def settle(
     )  # fmt: skip
 
 
+def warm_up() -> None:
+    """Compile what only an image with pixels at risk comes to."""
+    position, sigma, confidence = np.zeros((3, 4), np.float32)
+    settle(position, sigma, confidence, np.zeros(4, np.uint8), 2, 1.0)
+
+
 @kernel
 def _settle(
     position: Map,

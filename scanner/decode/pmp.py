@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode import Decoded, Reason
+from scanner.decode import Decoded, Reason, neighbours
 from scanner.decode.agreement import disagreements
 from scanner.decode.frames import FrameCheck
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis
@@ -204,3 +204,4 @@ def warm_up() -> None:
         for position in range(len(sequence)):
             decoder.add(position, sequence.image(position).astype(decoder.camera.dtype))
         decoder.finish()
+    neighbours.warm_up()

@@ -1,4 +1,4 @@
-"""What is drawn on a terminal, and what stands there instead in a log; that no kernel waits for the first scan."""
+"""What is drawn on a terminal, and what stands there instead in a log."""
 
 import json
 import re
@@ -8,9 +8,7 @@ from pathlib import Path
 import pytest
 
 from service.terminal import print_error, print_facts, print_json, print_table, progress_lines
-from service.warm_up import modules_with_kernels
 
-ROOT = Path(__file__).parents[2]
 COLOURS = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
@@ -58,16 +56,3 @@ def test_a_terminal_gets_bars_and_tables(capsys: pytest.CaptureFixture[str], mon
 def test_json_holds_no_word_that_json_does_not_know(capsys: pytest.CaptureFixture[str]) -> None:
     print_json({"a": [float("nan"), float("inf"), 1.5], "p": Path("x"), 3: None})
     assert json.loads(capsys.readouterr().out) == {"a": [None, None, 1.5], "p": "x", "3": None}
-
-
-def test_every_kernel_is_compiled_at_set_up() -> None:
-    """A module with kernels is named by a module of its own folder that set-up warms up, or offers that itself."""
-    warmed = {name.replace(".", "/") for name in modules_with_kernels()}
-    sources = {path: path.read_text() for package in ("scanner", "drivers") for path in (ROOT / package).rglob("*.py")}
-    for path, text in sources.items():
-        if not re.search(r"^@(parallel_)?kernel", text, flags=re.MULTILINE):
-            continue
-        place = str(path.relative_to(ROOT).with_suffix(""))
-        near = [p for p in sources if p.parent == path.parent and path.stem in sources[p]]
-        names = {str(p.relative_to(ROOT).with_suffix("")).removesuffix("/__init__") for p in near}
-        assert place in warmed or names & warmed, f"{place} has kernels that set-up does not compile"

@@ -20,6 +20,7 @@ module; it is not this one.
 
 from __future__ import annotations
 
+from scanner.decode.mcp import carriers
 from scanner.decode.mcp.decoder import McpDecoder, decode_image
 from scanner.patterns import CameraFormat, McpPattern, ProjectorSize
 
@@ -35,3 +36,4 @@ def warm_up() -> None:
         camera = CameraFormat(projector.width, projector.height, bits)
         frame = (10 + light * (0.8 * camera.max_value)).astype(camera.dtype)
         decode_image(frame, pattern, projector, camera)
+    carriers.warm_up()

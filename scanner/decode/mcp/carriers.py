@@ -233,6 +233,11 @@ def _align(
     return CarrierSearch(float(scales[q]), drift_x, drift_y, tuple(float(c) for c in np.exp(seen)))
 
 
+def warm_up() -> None:
+    """Compile what only an image with long stripes comes to."""
+    _shifted_sum(np.zeros((1, 2, 1)), np.zeros(1, np.int32), np.zeros((2, 1)))
+
+
 @kernel
 def _shifted_sum(score: NDArray[np.float64], shift: Ints, total: NDArray[np.float64]) -> None:
     """Sum over the tiles of `score` (T, Q, N), each moved by its own `shift` along Q; (Q, N)."""
