@@ -7,8 +7,10 @@ copied out of the spool first and checked then: a ring that was faster shows its
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -32,6 +34,10 @@ if TYPE_CHECKING:
 
 COUNTS_S = 0.25
 """Counts are said this often."""
+
+TURN_S = 0.0005
+"""The interpreter's turn where several threads want it. In its usual 5 ms a frame's message, or a result, would wait a
+third of a frame at 60 a second for a thread that does not call a kernel just then."""
 
 _log = logging.getLogger(__name__)
 
@@ -82,6 +88,7 @@ class LiveWork:
             threading.Thread(target=self._decode, args=(decoder,), name=f"live-{number}", daemon=True)
             for number, decoder in enumerate(decoders)
         ]
+        self._before = _in_short_turns()
         for thread in self._threads:
             thread.start()
 
@@ -107,6 +114,7 @@ class LiveWork:
                 self._counter.dropped += 1
                 self._newest = None
         self._publisher.close()
+        self._before()
         self._say_counts(0.0)
 
     def _say_counts(self, period_s: float) -> None:
@@ -180,6 +188,28 @@ class LiveWork:
             error=problem,
         )
         return _Result(header, b"" if found is None else found.values.data.cast("B"))
+
+
+def _in_short_turns() -> Callable[[], None]:
+    """Have this process take frames evenly; returns what undoes it.
+
+    Turns are short, OpenCV starts no threads beside those that decode, and the collector of cycles passes over all
+    that is there already: walking through it takes as long as a frame.
+    """
+    import cv2  # noqa: PLC0415  (as above)
+
+    turn, threads = sys.getswitchinterval(), cv2.getNumThreads()
+    sys.setswitchinterval(TURN_S)
+    cv2.setNumThreads(1)
+    gc.collect()
+    gc.freeze()
+
+    def undo() -> None:
+        gc.unfreeze()
+        cv2.setNumThreads(threads)
+        sys.setswitchinterval(turn)
+
+    return undo
 
 
 @dataclass(frozen=True, eq=False)
