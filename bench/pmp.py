@@ -16,6 +16,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
+import numba
 import numpy as np
 
 from scanner.decode import graycode, pmp
@@ -47,6 +48,7 @@ def main():
         kind = pmp.PmpDecoder
         pmp.warm_up()
     stacks = [frames_of(sequence, camera, seed) for seed in range(STACKS)]
+    read(np.zeros(8, np.uint64))
     print(f"{len(sequence)} frames {width} x {height}, {camera.dtype}; ms, median (least)")
     for threads in sorted({1, threads_to_use()}):
         measure(kind, sequence, camera, stacks, chosen.runs, threads)
@@ -155,6 +157,15 @@ def frames_of(sequence, camera, seed):
     return stack
 
 
+@numba.njit(nogil=True)
+def read(words):
+    """All bits of all words, in one: nothing reads memory faster (np.bitwise_or.reduce takes half as long again)."""
+    bits = np.uint64(0)
+    for i in range(words.size):
+        bits |= words[i]
+    return bits
+
+
 _maps = {}
 
 
@@ -164,7 +175,7 @@ def read_and_write(stack, threads):
     maps = _maps.setdefault(stack.shape[1:], np.full(2 * stack[0].size, 0, np.float32))
 
     def part(i):
-        np.bitwise_or.reduce(words[i * words.size // threads : (i + 1) * words.size // threads])
+        read(words[i * words.size // threads : (i + 1) * words.size // threads])
         maps[i * maps.size // threads : (i + 1) * maps.size // threads].fill(1)
 
     begin = time.perf_counter()

@@ -157,22 +157,13 @@ def _fit_blocks(
             # What the next tile will ask for, set by set: fetched while this one is worked on.
             for n in range(starts[k], starts[k + 1]):
                 expect_pixels(addresses[n], at + ahead, ahead, like)
-        first, phases, squares, inverses = starts[k], rows[k], rows[sets + k], rows[2 * sets + k]
+        first = starts[k]
         if whole[k] == 8:
-            _fit_eight(
-                addresses, like, first, weights[:, first : first + 3], share, at, begin, end,
-                phases, squares, inverses, mean, residual, top,
-            )  # fmt: skip
+            _fit_eight(addresses, like, first, weights[:, first : first + 3], share, at, begin, end, k, rows)
         elif whole[k] == 4:
-            _fit_four(
-                addresses, like, first, weights[:, first : first + 2], share, at, begin, end,
-                phases, squares, inverses, mean, residual, top,
-            )  # fmt: skip
+            _fit_four(addresses, like, first, weights[:, first : first + 2], share, at, begin, end, k, rows)
         else:
-            _fit_any(
-                addresses, like, first, starts[k + 1], weights, grams[k], share, at, begin, end,
-                phases, squares, inverses, mean, residual, top,
-            )  # fmt: skip
+            _fit_any(addresses, like, first, starts[k + 1], weights, grams[k], share, at, begin, end, k, rows)
 
 
 @contracting_kernel
@@ -185,13 +176,10 @@ def _fit_eight(
     at: int,
     begin: int,
     end: int,
-    phases: NDArray[np.float32],
-    squares: NDArray[np.float32],
-    inverses: NDArray[np.float32],
-    mean: NDArray[np.float32],
-    residual: NDArray[np.float32],
-    top: NDArray[np.float32],
+    k: int,
+    rows: NDArray[np.float32],
 ) -> None:
+    phases, squares, inverses, mean, residual, top = _rows_of(rows, k)
     # Samples half a turn apart: their difference has the odd harmonics alone, the fringe and the third; their sum what
     # is no fringe at all. Weights say how the set's phase counts: which way, and from where.
     direction = np.float32(16) * (weights[1, 0] * weights[2, 2] - weights[1, 2] * weights[2, 0])
@@ -230,13 +218,10 @@ def _fit_four(
     at: int,
     begin: int,
     end: int,
-    phases: NDArray[np.float32],
-    squares: NDArray[np.float32],
-    inverses: NDArray[np.float32],
-    mean: NDArray[np.float32],
-    residual: NDArray[np.float32],
-    top: NDArray[np.float32],
+    k: int,
+    rows: NDArray[np.float32],
 ) -> None:
+    phases, squares, inverses, mean, residual, top = _rows_of(rows, k)
     direction = _F4 * (weights[1, 0] * weights[2, 1] - weights[1, 1] * weights[2, 0])
     origin = np.float32(np.arctan2(weights[2, 0], weights[1, 0])) * _PER_TURN
     level = share * _QUARTER
@@ -267,13 +252,10 @@ def _fit_any(
     at: int,
     begin: int,
     end: int,
-    phases: NDArray[np.float32],
-    squares: NDArray[np.float32],
-    inverses: NDArray[np.float32],
-    mean: NDArray[np.float32],
-    residual: NDArray[np.float32],
-    top: NDArray[np.float32],
+    k: int,
+    rows: NDArray[np.float32],
 ) -> None:
+    phases, squares, inverses, mean, residual, top = _rows_of(rows, k)
     g00, g11, g22, g01, g02, g12 = gram[0], gram[1], gram[2], gram[3], gram[4], gram[5]
     for i in range(begin, end, LANES):
         # Differences from the first frame: small numbers, so that float32 keeps the residual of 16-bit frames.
@@ -295,6 +277,13 @@ def _fit_any(
         store(squares, i, square)
         store(inverses, i, inverse)
         store(phases, i, phase)
+
+
+@contracting_kernel
+def _rows_of(rows: NDArray[np.float32], k: int) -> tuple[NDArray[np.float32], ...]:
+    """The rows that the k-th set writes, and the three that all sets add to."""
+    sets = (rows.shape[0] - 3) // 3
+    return rows[k], rows[sets + k], rows[2 * sets + k], rows[3 * sets], rows[3 * sets + 1], rows[3 * sets + 2]
 
 
 @contracting_kernel
