@@ -32,7 +32,6 @@ def spoilt(count: int, bad: dict[int, tuple[str, float]], seed: int = 0) -> list
     ("count", "bad"),
     [
         (5, {2: ("camera", 3.0)}),
-        (5, {0: ("projector", 20.0)}),
         (4, {1: ("projector", 3.0)}),
         (5, {1: ("projector", 3.0), 4: ("camera", 20.0)}),
         (10, {3: ("camera", 0.5)}),
