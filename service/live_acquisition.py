@@ -72,7 +72,7 @@ class LiveRun(Scan):
             repeat=SEGMENT,
             calibration=None if lenses is None else "calibration.json",
             plan=self._plan.as_dict(),
-            extra={"exposure": self._exposure},
+            extra={"exposure": self._exposure, **self._opened.scan_state(self._clock)},
         )
         try:
             storage = self._storage(header, lenses)
