@@ -20,7 +20,7 @@ from scanner.capture.exposure import exposure_report, exposure_warnings
 from scanner.carrier_check import require_carriers
 from scanner.compare import compare
 from scanner.contrast import widen_at_edges
-from scanner.decode import Decoded, Decoder, Reason, decoder_for
+from scanner.decode import Decoded, Decoder, KeepingDecoder, Reason, decoder_for
 from scanner.decode.repeated import Repetitions
 from scanner.decode.stages import Observer
 from scanner.devices import Pixels, Truth
@@ -100,13 +100,15 @@ class Reconstruction:
         self._failed: dict[int, DecodeError] = {}
         self._slots: dict[int, int | None] = {}
 
-    def add(self, pattern: int, frame: Pixels, slot: int | None = None) -> None:
+    def add(self, pattern: int, frame: Pixels, slot: int | None = None, *, stays: bool = False) -> None:
         """Take one frame.
 
         Args:
             pattern: repetition x patterns + position.
-            frame: (H, W) uint8 or uint16; not kept.
+            frame: (H, W) uint8 or uint16.
             slot: its slot in the folder.
+            stays: the pixels do not change before `finish` has returned, as in a folder: decoders that can work on
+                them where they lie. Else the frame is not kept.
 
         Raises:
             DecodeError: see `scanner.decode.Decoder.add`.
@@ -117,7 +119,9 @@ class Reconstruction:
         with self._timed("decode frames"):
             if repetition not in self._decoders:
                 self._decoders[repetition] = self._new_decoder()
-            self._decoders[repetition].add(position, frame)
+            decoder = self._decoders[repetition]
+            take = decoder.keep if stays and isinstance(decoder, KeepingDecoder) else decoder.add
+            take(position, frame)
         self._slots[pattern] = slot
         if self._header.repeat > 1 and self._is_whole(repetition):
             self._end_repetition(repetition)
@@ -226,7 +230,7 @@ class Reconstruction:
             self._begin()
         for pattern, slot in present.items():
             if pattern not in self._slots:
-                self.add(pattern, capture.frame(pattern), slot)
+                self.add(pattern, capture.frame(pattern), slot, stays=True)
 
     def _new_decoder(self, observer: Observer | None = None) -> Decoder:
         return decoder_for(self._header.sequence, self._header.camera, self._options.decoder, observer)
@@ -275,7 +279,7 @@ def reconstruct(
     tell("reading frames")
     reconstruction = Reconstruction(capture.header, calibration, options or DecodeOptions(), observer)
     for pattern, record in capture.records.items():
-        reconstruction.add(pattern, capture.frame(pattern), record.slot)
+        reconstruction.add(pattern, capture.frame(pattern), record.slot, stays=True)
     return reconstruction.finish(capture, progress)
 
 

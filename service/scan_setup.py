@@ -226,7 +226,9 @@ def pattern_for(method: str, given: Mapping[str, Any], axis: Axis, projector: Pr
         raise ConfigError(f"the pattern is {given['method']!r}, the method {method!r}", hint="leave one of them out")
     default = default_pattern(method, tuple(given.get("axes") or (axis,)), given.get("axis", axis), projector)
     if method == "gray+pmp" and "frequencies" in given:
-        default = default_gray_pmp(tuple(given.get("axes") or (axis,)), projector, read_numbers(given, "frequencies")[0])
+        default = default_gray_pmp(
+            tuple(given.get("axes") or (axis,)), projector, read_numbers(given, "frequencies")[0]
+        )
     _refuse_unknown(method, given, default)
     described = {**default.describe(), **given}
     if method == "pmp" and "frequencies" in given and "shifts" not in given:

@@ -190,7 +190,7 @@ class _Series:
         if message.slot is not None and message.status == "ok":
             pixels = self._frames.at(message)
             if pixels is not None and self._reconstruction is not None:
-                self._reconstruction.add(message.pattern, pixels, message.slot)
+                self._reconstruction.add(message.pattern, pixels, message.slot, stays=True)
         self._taken += 1
         if self._taken % ACK_EVERY == 0:
             self._answer(Ack(self.delivery, self._taken))

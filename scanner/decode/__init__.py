@@ -88,6 +88,14 @@ class Decoder(Protocol):
 
 
 @runtime_checkable
+class KeepingDecoder(Decoder, Protocol):
+    """A decoder that can work on frames where they lie."""
+
+    def keep(self, position: int, frame: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+        """Like `add`, without a copy: the frame must not change before `finish` has returned."""
+
+
+@runtime_checkable
 class SeriesDecoder(Decoder, Protocol):
     """A decoder that may be used again: what one frame teaches (where the pattern is, how large) helps with the next.
 
