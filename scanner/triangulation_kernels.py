@@ -114,9 +114,7 @@ def _line_of_planes(xs: Array, ys: Array, rows: Map, spread: Map, numbers: Numbe
         sigma = np.float64(spread[j]) * before / (fy * abs(across))
         possible = (z > 0.0) & (before > 0.0) & (sigma <= MAX_RELATIVE_SIGMA * z)
         missing += (not possible) & (not math.isnan(rows[j]))
-        depth = z if possible else np.nan
-        points[3 * j], points[3 * j + 1], points[3 * j + 2] = depth * xs[j], depth * ys[j], depth
-        sigma_z[j] = sigma if possible else np.nan
+        _put(j, z if possible else np.nan, sigma if possible else np.nan, xs, ys, points, sigma_z)
     return missing
 
 
@@ -149,9 +147,7 @@ def _line_of_curves(xs: Array, ys: Array, rows: Map, spread: Map, numbers: Numbe
         # Quadratic convergence: after a step of 0.01 px less than 1e-6 px is left.
         possible &= abs(y0 - seen) * fy < 0.01
         missing += (not possible) & (not math.isnan(rows[j]))
-        depth = z if possible else np.nan
-        points[3 * j], points[3 * j + 1], points[3 * j + 2] = depth * xs[j], depth * ys[j], depth
-        sigma_z[j] = sigma if possible else np.nan
+        _put(j, z if possible else np.nan, sigma if possible else np.nan, xs, ys, points, sigma_z)
     return missing
 
 
@@ -168,6 +164,12 @@ def _bent(x: float, y: float, k: float, numbers: Numbers) -> tuple[float, float]
 
 
 @kernel
+def _put(j: int, z: float, sigma: float, xs: Array, ys: Array, points: Map, sigma_z: Map) -> None:
+    points[3 * j], points[3 * j + 1], points[3 * j + 2] = z * xs[j], z * ys[j], z
+    sigma_z[j] = sigma
+
+
+@kernel
 def _rest_of_line(xs: Array, ys: Array, rows: Map, spread: Map, numbers: Numbers, points: Map, sigma_z: Map) -> int:
     """Points for rows that `_line_of_curves` left without; return how many stay so."""
     missing = 0
@@ -178,8 +180,7 @@ def _rest_of_line(xs: Array, ys: Array, rows: Map, spread: Map, numbers: Numbers
         z, square = _finish(np.float64(rows[j]), 0.0, 0.0, direction, numbers)
         sigma = np.float64(spread[j]) / np.sqrt(square)
         if z > 0.0 and z * direction[2] + numbers[11] > 0.0 and sigma <= MAX_RELATIVE_SIGMA * z:
-            points[3 * j], points[3 * j + 1], points[3 * j + 2] = z * xs[j], z * ys[j], z
-            sigma_z[j] = sigma
+            _put(j, z, sigma, xs, ys, points, sigma_z)
         else:
             missing += 1
     return missing
