@@ -146,9 +146,11 @@ def test_what_cannot_run_is_refused_in_words(
 
 def test_a_recording_decoded_later_gives_the_same(client: Client, tmp_path: Path) -> None:
     seen = {}
-    with client.live(retain="record", seconds=0.5, **SHORT) as frames:
+    with client.live(retain="record", **SHORT) as frames:
         for frame in frames:
             seen[frame.number] = frame.values.copy()
+            if len(seen) > 10:
+                break
         job = frame.header.job
     outcome = client.wait(job)
     assert (outcome["state"], outcome["report"]["recorded"]["frames"]) == ("done", outcome["report"]["captured"])
@@ -159,7 +161,6 @@ def test_a_recording_decoded_later_gives_the_same(client: Client, tmp_path: Path
     decoder = LiveReconstruction(
         capture.header, load_calibration(part.path / "calibration.json"), DecodeOptions(), follow=False
     )
-    assert len(seen) > 5
     for number in sorted(seen)[::5]:
         # Live, one frame helps with the next: a value on a threshold may fall the other way, a thousandth of them.
         assert np.mean(decoder.result(capture.frame(number)).values == seen[number]) > 0.999
