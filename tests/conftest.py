@@ -35,16 +35,6 @@ LONG_LIVED = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
 CHANCES = 3
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Where several processes share the tests (`make test`): a file of units stays together, for its fixtures; tests
-    that start processes and watch the clock stay out of one another's way, all in one group.
-    """
-    units = Path(__file__).parent / "unit"
-    for item in items:
-        group = item.path.name if item.path.is_relative_to(units) else "processes and clocks"
-        item.add_marker(pytest.mark.xdist_group(group))
-
-
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
     """Tests marked `real_time` have an emulator that must keep up with the clock: on a busy machine it gets chances."""
     if item.get_closest_marker("real_time") is None:

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -89,8 +90,7 @@ def test_a_scan_told_to_stop_leaves_nothing(number: signal.Signals, status: int,
 
 
 def test_a_scan_that_is_killed_leaves_no_private_folder(tmp_path: Path) -> None:
-    private = tmp_path / "private"
-    private.mkdir()
+    private = Path(tempfile.mkdtemp())  # short: with a longer one sockets would go elsewhere
     words = ("scan", "--rig", "simulated:quick/board", "--repeat", "20", "-o", tmp_path / "out")
     with running(*words, environment={"TMPDIR": str(private)}) as scan:
         deadline = time.monotonic() + PATIENCE_S
@@ -102,6 +102,7 @@ def test_a_scan_that_is_killed_leaves_no_private_folder(tmp_path: Path) -> None:
     while list(private.iterdir()):
         assert time.monotonic() < deadline
         time.sleep(0.02)
+    private.rmdir()
 
 
 @pytest.mark.parametrize("imported", ["service.program", "typer", "scanner.client"])
