@@ -68,7 +68,7 @@ class FilterSettings:
     def __post_init__(self) -> None:
         if not 0 < self.max_angle_deg < 90:
             raise ConfigError(f"filter max_angle_deg must lie between 0 and 90 degrees, got {self.max_angle_deg:g}")
-        if self.min_fragment < 0:
+        if not 0 <= self.min_fragment < 2**31:
             raise ConfigError(f"filter min_fragment must be 0 or more pixels, got {self.min_fragment}")
         if not 0 <= self.min_confidence <= 1:
             raise ConfigError(f"filter min_confidence must lie in 0 .. 1, got {self.min_confidence:g}")

@@ -19,7 +19,15 @@ from numpy.typing import NDArray
 from scanner.calibration_spread import depth_spread
 from scanner.decode.pmp_frames import design_matrix
 from scanner.geometry import Calibration
-from scanner.patterns import Axis, CompositePattern, GrayPmpPattern, PatternSequence, PmpPattern, ProjectorSize
+from scanner.patterns import (
+    Axis,
+    CompositePattern,
+    GrayPmpPattern,
+    McpPattern,
+    PatternSequence,
+    PmpPattern,
+    ProjectorSize,
+)
 from scanner.patterns.sequence import Precorrection
 from scanner.scan import Scan
 
@@ -82,6 +90,13 @@ class Budget:
 _CROSS_TALK = Contribution(
     "method", "systematic", None, None, "cross-talk of the channels: centimetres (Casey 2011, table 5.6)"
 )
+_BETWEEN_STRIPES = Contribution(
+    "method", "systematic", None, None,
+    "one frame measures along its stripes: between them the surface is drawn through, and where it bends or steps "
+    "there, or a stripe has a wrong name, errors are many times larger",
+)  # fmt: skip
+_METHODS = {CompositePattern: _CROSS_TALK, McpPattern: _BETWEEN_STRIPES}
+"""What no sigma of a point contains"""
 
 
 def budget_of(
@@ -113,7 +128,7 @@ def budget_of(
     noise = Contribution("noise", "random", noise_px, noise_mm, f"median of the points' sigmas{of_repeats}")
     fringes = _fringes(sequence)
     light = [] if fringes is None else [_response(scan, axis), _grey_levels(sequence, axis)]
-    method = [_CROSS_TALK] if isinstance(sequence.pattern, CompositePattern) else []
+    method = [says for kind, says in _METHODS.items() if isinstance(sequence.pattern, kind)]
     causes = (noise, *light, *method, _sync(sequence, mixed, axis))
     contributions = [_in_mm(cause, per_px) for cause in causes]
     contributions.insert(1, _calibration(scan, calibration, axis))

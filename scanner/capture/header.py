@@ -94,6 +94,8 @@ class FrameRecord:
             raise ValueError("not a frame record")
         if status not in ("ok", "incomplete", "missing") or line["pattern"] < 0 or (slot is not None and slot < 0):
             raise ValueError("not a frame record")
+        if any(not isinstance(line.get(count), int | None) for count in ("frame_id", "trigger")):
+            raise TypeError("not a frame record")
         return cls(
             slot=None if slot is None else int(slot),
             pattern=int(line["pattern"]),
@@ -102,14 +104,17 @@ class FrameRecord:
             xxh3=xxh3,
             frame_id=line.get("frame_id"),
             trigger=line.get("trigger"),
-            exposure=exposure
-            and Exposure(
+            exposure=None
+            if exposure is None
+            else Exposure(
                 int(exposure["start_ns"]),
                 int(exposure["end_ns"]),
                 int(exposure["bound_ns"]),
                 Source(exposure["source"]),
             ),
-            flip=flip and Flip(int(flip["t_ns"]), int(flip["vblank"]), int(flip["bound_ns"]), Source(flip["source"])),
+            flip=None
+            if flip is None
+            else Flip(int(flip["t_ns"]), int(flip["vblank"]), int(flip["bound_ns"]), Source(flip["source"])),
             verdict=line.get("verdict", "unproved"),
         )
 

@@ -75,9 +75,11 @@ def _uncertainty(budget: Mapping[str, Any]) -> tuple[str, str] | None:
     """One line of the budget: what a point's depth is good to, and what is not in that."""
     if not budget or budget.get("expanded_mm") is None:
         return None
-    unknown = ", ".join(budget.get("unknown") or ())
+    names = budget.get("unknown") or ()
+    unknown = ", ".join(names)
+    whom = "what is known of it" if "method" in names else "of 95 in 100 points"
     text = (
-        f"+-{budget['expanded_mm']:.3f} mm at {budget['depth_mm']:.0f} mm, of 95 in 100 points: "
+        f"+-{budget['expanded_mm']:.3f} mm at {budget['depth_mm']:.0f} mm, {whom}: "
         f"{budget['random_mm']:.3f} mm random and {budget['systematic_mm']:.3f} mm systematic (1 sigma)"
     )
     return "uncertainty", f"{text}{f'; unknown, and not in it: {unknown}' if unknown else ''}"

@@ -343,3 +343,10 @@ def test_the_exposure_that_was_used_is_told_and_warned_of_where_it_is_another() 
     assert exposure_report(header()) is None
     for told in (None, 3, {"warning": 5, "asked_us": "long"}):
         assert exposure_warnings(replace(given, extra={"exposure": told})) == ()
+
+
+@pytest.mark.parametrize("member", ["frame_id", "trigger", "exposure", "flip"])
+@pytest.mark.parametrize("value", [[], {}, "x"])
+def test_a_record_with_a_member_of_another_kind_is_none(member: str, value: object) -> None:
+    with pytest.raises((KeyError, TypeError, ValueError)):
+        FrameRecord.from_dict({"slot": 0, "pattern": 0, member: value})

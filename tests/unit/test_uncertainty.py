@@ -9,7 +9,15 @@ import pytest
 
 from scanner.calibration_spread import LENS_MEMBERS, depth_spread, moved
 from scanner.decode import decoder_for
-from scanner.patterns import CameraFormat, CompositePattern, GrayPattern, PatternSequence, PmpPattern, ProjectorSize
+from scanner.patterns import (
+    CameraFormat,
+    CompositePattern,
+    GrayPattern,
+    McpPattern,
+    PatternSequence,
+    PmpPattern,
+    ProjectorSize,
+)
 from scanner.patterns.sequence import Precorrection
 from scanner.scan import build_scan
 from scanner.triangulation import triangulate
@@ -104,7 +112,9 @@ def test_what_cannot_be_told_is_in_no_sum(scene):
     assert found.unknown == ("calibration", "response", "sync")
     gray = PatternSequence(ProjectorSize(400, 300), GrayPattern(("y",), 9, 9))
     composite = PatternSequence(SEQUENCE.projector, CompositePattern("y", (20.0, 40.0, 60.0, 80.0)))
-    assert "method" in budget_of(scan_of(scene), scene.calibration, composite, 0.0).unknown
+    stripes = PatternSequence(SEQUENCE.projector, McpPattern(bits=2, carriers=(20.0, 34.0), codes=(0, 1, 2, 3)))
+    for sequence in (composite, stripes):
+        assert "method" in budget_of(scan_of(scene), scene.calibration, sequence, 0.0).unknown
     found = budget_of(scan_of(scene), scene.calibration, gray, 0.2)
     assert found is not None
     assert [c.name for c in found.contributions] == ["noise", "calibration", "sync"]
