@@ -270,6 +270,20 @@ def test_a_pair_of_code_frames_that_is_the_next_one_again_is_named(bit: int) -> 
     assert set(questioned(capture, dict(zip(own, later, strict=True))).suspects) >= set(own)
 
 
+@pytest.mark.parametrize("factor", [0.7, 0.9, 0.95])
+@pytest.mark.parametrize("pattern", ["4 shifts", "3 shifts"])
+def test_frequencies_that_were_not_projected_are_told_by_the_bars(pattern: str, factor: float) -> None:
+    capture = taken(pattern)
+    content = capture.sequence.describe()
+    content["frequencies"] = [factor * f for f in content["frequencies"]]
+    described = PatternSequence.from_description(capture.sequence.projector, content)
+    found = witness(described, capture.thumbnails, capture.format.max_value)
+    (wrong,) = [item for item in found.items if not item.passed]
+    assert wrong.name == "order bars y"
+    assert f"{factor:.1f}"[:2] in wrong.says
+    assert "frequencies or projector size" in wrong.says
+
+
 def test_a_frame_of_bars_that_shows_none_is_named() -> None:
     capture = gray_taken("board")
     bars = capture.sequence.bars["y"]
