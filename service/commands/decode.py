@@ -64,7 +64,7 @@ def decode(
       fringed decode scan/capture -o again --no-edge-filter
       fringed decode skull/capture-gray.json --calibration skull/calibration.json
       fringed decode old/capture --depth 380:430 --force
-      fringed decode scan/capture -o again --decoder casey2011 --stages pictures
+      fringed decode one-frame/capture -o published --decoder casey2011 --stages pictures
       fringed decode take1 --frames 100:109                a recording of fringed live
     """
     filters = filter_members(depth, box, min_confidence, edge_filter=edge_filter)
