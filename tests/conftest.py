@@ -31,6 +31,8 @@ PATIENCE_S = 2.0
 LONG_LIVED = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
 """Helpers that Python keeps until it exits, by design"""
 
+KERNEL_THREAD = 0x0020_0000
+"""PF_KTHREAD among the flags of /proc/PID/stat (proc(5)): it has neither command line nor environment"""
 
 CHANCES = 3
 
@@ -127,19 +129,22 @@ def _processes() -> Iterator[str]:
     for name in living - _strangers:
         folder = Path("/proc", name)
         try:
-            # The name in brackets may hold blanks; state and parent follow the last bracket.
-            state, parent = (folder / "stat").read_text().rpartition(")")[2].split()[:2]
-            marked = MARK.encode() in (folder / "environ").read_bytes().split(b"\0")
+            # The name in brackets may hold blanks; state, parent and flags follow the last bracket.
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+            environment = (folder / "environ").read_bytes()
             command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
         except PermissionError:
             _strangers.add(name)  # another user's
             continue
         except (OSError, ValueError):
             continue  # it ended while we looked
-        if not marked and parent != me:
+        state, parent, of_kernel = fields[0], fields[1], int(fields[6]) & KERNEL_THREAD
+        if not environment and not command and not of_kernel and state not in "ZX":
+            yield f"{name} (in the middle of its start)"  # whose it is shows at the next look
+        elif MARK.encode() not in environment.split(b"\0") and parent != me:
             _strangers.add(name)
-        elif state != "Z" and not any(name in command for name in LONG_LIVED):
-            yield f"{folder.name} ({command[:120]})"
+        elif state not in "ZX" and not any(name in command for name in LONG_LIVED):
+            yield f"{name} ({command[:120]})"
 
 
 def _sockets() -> Iterator[str]:

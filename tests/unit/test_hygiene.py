@@ -1,5 +1,8 @@
 """The suite's own promise: what a test leaves behind is found and named."""
 
+import os
+import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,10 +15,10 @@ import socket, subprocess, tempfile, threading
 kept = []
 
 def test_process():
-    subprocess.run(["sh", "-c", "setsid sleep 1 >&- 2>&- &"], check=True)
+    subprocess.run(["sh", "-c", "setsid sleep 20 >&- 2>&- &"], check=True)
 
 def test_thread():
-    threading.Thread(target=threading.Event().wait, args=(1,), daemon=True, name="wanderer").start()
+    threading.Thread(target=threading.Event().wait, args=(20,), daemon=True, name="wanderer").start()
 
 def test_socket():
     kept.append(socket.socketpair())
@@ -55,8 +58,9 @@ def test_every_kind_of_leftover_is_named(tmp_path: Path) -> None:
         cwd=tmp_path,
     )
     left = {line.split(" left behind: ")[0].split()[-1]: line for line in ran.stdout.splitlines() if "left be" in line}
-    assert "process" in left["test_process"]
-    assert "sleep" in left["test_process"]
+    found = re.search(r"process (\d+) \(.*sleep 20", left["test_process"])
+    assert found
+    os.kill(int(found[1]), signal.SIGKILL)
     assert "thread wanderer" in left["test_thread"]
     assert "socket" in left["test_socket"]
     assert "leftover-" in left["test_file"]
