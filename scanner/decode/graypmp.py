@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scanner.decode import Decoded, Map, Reason
 from scanner.decode.frames import FrameCheck
 from scanner.decode.graycode import GrayDecoder
+from scanner.decode.phase_and_code import PhaseAndCode, compare_phase_and_code
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis
 from scanner.decode.pmp_frames import axis_frames
 from scanner.decode.reasons import REASONS
@@ -61,12 +62,14 @@ class GrayPmpDecoder:
         """The maps.
 
         Raises:
-            DecodeError: frames without which phase or code cannot be read are missing; they are named.
+            DecodeError: frames without which phase or code cannot be read are missing; they are named. Or phase and
+                code contradict each other.
         """
         self._require_fringes()
         found = {axis: self._phases(axis) for axis in self._pattern.axes}
         code = self._code(next(iter(found.values())).maps)
         warnings = list(code.warnings)
+        agreement: dict[Axis, PhaseAndCode] = {}
         for axis, of_axis in found.items():
             cells = code.rows if axis == "y" else code.columns
             if cells is None:
@@ -74,6 +77,12 @@ class GrayPmpDecoder:
             along = self._sequence.projector.along(axis)
             period = along / self._pattern.pmp.frequencies[0]
             m = of_axis.maps
+            sound = (m.reason == Reason.VALUE) & (code.reason.reshape(-1) == Reason.VALUE)
+            agreement[axis] = compare_phase_and_code(
+                m.position, cells.reshape(-1), sound, axis, period, self._pattern.cell_px
+            )
+            agreement[axis].require()
+            warnings += filter(None, [agreement[axis].warning()])
             _choose_fringe(
                 m.position, m.sigma, m.confidence, m.reason, cells.reshape(-1), code.confidence.reshape(-1),
                 code.reason.reshape(-1), np.float32(period), np.float32(along), np.float32(MOST_APART),
@@ -84,7 +93,7 @@ class GrayPmpDecoder:
         if other:
             first.join(other[0])
         counts = np.bincount(first.reason, minlength=REASONS)
-        return self._decoded(found, first, code, counts, tuple(warnings))
+        return self._decoded(found, agreement, first, code, counts, tuple(warnings))
 
     def _require_fringes(self) -> None:
         lost: list[int] = []
@@ -132,6 +141,7 @@ class GrayPmpDecoder:
     def _decoded(
         self,
         found: dict[Axis, AxisFound],
+        agreement: dict[Axis, PhaseAndCode],
         maps: AxisMaps,
         code: Decoded,
         counts: NDArray[np.int64],
@@ -158,6 +168,7 @@ class GrayPmpDecoder:
                 "counts": {r.name.lower(): int(counts[r]) for r in Reason if counts[r]},
                 "noise": asdict(next(iter(found.values())).noise),
                 "light": {axis: f.light.as_dict() for axis, f in found.items()},
+                "phase_and_code": {axis: a.as_dict() for axis, a in agreement.items()},
                 "code": {key: code.details[key] for key in ("counts", "thresholds", "noise_factor")},
             },
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -156,3 +158,57 @@ def test_other_patterns_are_not_its_business():
 
     with pytest.raises(DecodeError, match="pmp"):
         GrayPmpDecoder(PatternSequence(PROJECTOR, PmpPattern(("x",), (1.0,), (3,))), CAMERA)
+
+
+def described(sequence, **members):
+    """The same frames by another description of the fringes."""
+    pattern = sequence.pattern
+    return PatternSequence(PROJECTOR, replace(pattern, pmp=replace(pattern.pmp, **members)))
+
+
+@pytest.mark.parametrize(
+    ("axis", "members", "wrong"),
+    [
+        ("y", {"offset": 0.5}, "offset, origin or order"),
+        ("y", {"offset": np.pi}, "offset, origin or order"),
+        ("x", {"origin": 4.5}, "offset, origin or order"),
+        ("y", {"sign": 1}, "lie 0.50 of a fringe"),
+        ("y", {"frequencies": (16.0,)}, "frequency"),
+        ("x", {"frequencies": (20.5,)}, "frequency"),
+        ("y", {"frequencies": (19.0,)}, "do not follow the Gray code"),
+    ],
+)
+def test_fringes_that_contradict_the_code_are_refused(axis, members, wrong):
+    sequence = PatternSequence(PROJECTOR, default_gray_pmp((axis,), PROJECTOR))
+    with pytest.raises(DecodeError, match="frames and description contradict each other") as refused:
+        decode(described(sequence, **members), take(sequence))
+    assert wrong in f"{refused.value} {refused.value.hint}"
+
+
+@pytest.mark.parametrize("shifts", [3, 4, 8])
+def test_fringe_frames_rotated_by_one_contradict_the_code(shifts):
+    sequence = PatternSequence(PROJECTOR, default_gray_pmp(("y",), PROJECTOR, shifts=shifts))
+    frames = take(sequence)
+    fringes = sequence.fringes[:shifts]
+    rotated = frames | {to: frames[of] for to, of in zip(fringes, np.roll(fringes, 1), strict=True)}
+    with pytest.raises(DecodeError, match=f"lie {1 / shifts:.2f} of a fringe"):
+        decode(sequence, rotated)
+
+
+def test_a_small_shift_is_told_and_none_where_there_is_none():
+    sequence = PatternSequence(PROJECTOR, default_gray_pmp(("y",), PROJECTOR))
+    frames = take(sequence)
+    found = decode(sequence, frames)
+    assert abs(found.details["phase_and_code"]["y"]["shift_px"]) < 0.05
+    assert not any("Gray code" in said for said in found.warnings)
+    shifted = decode(described(sequence, offset=0.25), frames)
+    assert shifted.details["phase_and_code"]["y"]["shift_px"] == pytest.approx(-0.25 / (2 * np.pi) * 16, abs=0.1)
+    assert any("offset or origin of the description may be wrong" in said for said in shifted.warnings)
+
+
+def test_few_pixels_are_not_judged():
+    sequence = PatternSequence(PROJECTOR, default_gray_pmp(("y",), PROJECTOR))
+    dark = {position: np.where(np.arange(CAMERA.height)[:, None] < 20, f, 3) for position, f in take(sequence).items()}
+    found = decode(described(sequence, offset=0.5), {p: f.astype(np.uint8) for p, f in dark.items()})
+    assert np.isfinite(found.rows).any()
+    assert found.details["phase_and_code"]["y"]["cells"] < 8

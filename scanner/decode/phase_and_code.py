@@ -1,0 +1,129 @@
+"""Do fringes and code name the same places? A check of Gray + PMP on whole maps, not on pixels.
+
+A wrong `offset`, frequency or order of the fringe frames leaves no residual in one fringe set, and the code puts every
+phase on some fringe all the same. But where both are right, the phase's place lies within its cell, on the average in
+the middle of it. So the distance between the two tells of a shift that is constant (offset, rotated shifts), of one
+that grows along the projector (frequency), and of fringes that run the other way (sign): there it is anything at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.errors import DecodeError
+from scanner.patterns.description import Axis
+
+SAMPLES = 200_000
+"""About as many pixels are looked at; a cell of the code then has hundreds."""
+
+LEAST_IN_CELL = 8
+CELLS_TOGETHER = 8
+"""Neighbouring cells judged together. One that a shadow cuts is off its middle by an eighth of a fringe; that all of
+eight are cut alike takes a grating."""
+
+MOST_SHIFTED = 1 / 16
+"""Of a fringe: a quarter of the way to a cell's border. Gamma, blur and texture move the borders of cells either way;
+in eleven simulated scenes no eight cells together were shifted by more than .027."""
+
+MOST_GROUPS = 0.2
+"""Share of the groups of cells that may be shifted by more: surfaces that a narrow thing covers."""
+
+TOLD_SHIFT = 0.02
+CELLS_TO_TELL = 16
+"""A mean over as many cells that is shifted by more than TOLD_SHIFT of a fringe is worth a warning: in the same scenes
+it was shifted by .003 at most."""
+
+LEAST_FOLLOWING = 0.6
+"""Of what a cell's width makes of the mean direction of distances (a full turn being a fringe): phases that do not
+follow the code point anywhere, and their mean is short."""
+
+
+@dataclass(frozen=True)
+class PhaseAndCode:
+    """How far the phase's places lie from the middle of their cells, along one axis. Shifts in parts of a fringe."""
+
+    axis: Axis
+    period_px: float
+    groups: NDArray[np.float64]
+    """(G,) mean shift of neighbouring cells, along the projector"""
+    shift: float
+    """mean shift of all cells"""
+    following: float
+    """0 to 1, where 1 is what phases of the code's cells give"""
+    cells: int
+    """that were seen well enough to be judged"""
+
+    def require(self) -> None:
+        """Raise DecodeError where fringes and code contradict each other in many places."""
+        if not self.groups.size:
+            return
+        away = np.abs(self.groups) > MOST_SHIFTED
+        if self.following >= LEAST_FOLLOWING and away.mean() <= MOST_GROUPS:
+            return
+        if self.following < LEAST_FOLLOWING:
+            said, wrong = "do not follow the Gray code", "sign, frequency or order of the fringe frames"
+        else:
+            typical = float(np.median(np.abs(self.groups)))
+            said = f"lie {typical:.2f} of a fringe ({typical * self.period_px:.1f} projector px) from the Gray code"
+            grows = np.abs(np.exp(2j * np.pi * self.groups).mean()) < np.cos(2 * np.pi * MOST_SHIFTED)
+            wrong = "frequency" if grows else "offset, origin or order of the fringe frames"
+        raise DecodeError(
+            f"along {self.axis} the fringes {said} in {100 * away.mean():.0f} % of the places: "
+            f"frames and description contradict each other",
+            hint=f"compare the description's {wrong} with what was projected",
+        )
+
+    def warning(self) -> str | None:
+        """A shift that is small and everywhere, in words."""
+        if self.cells < CELLS_TO_TELL or abs(self.shift) <= TOLD_SHIFT:
+            return None
+        return (
+            f"along {self.axis} the fringes lie {self.shift * self.period_px:+.2f} projector px from the Gray code "
+            f"({self.cells} cells): offset or origin of the description may be wrong"
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """For report.json."""
+        return {"shift_px": self.shift * self.period_px, "following": self.following, "cells": self.cells}
+
+
+def compare_phase_and_code(
+    position: NDArray[np.float32],
+    cells: NDArray[np.float32],
+    sound: NDArray[np.bool_],
+    axis: Axis,
+    period_px: float,
+    cell_px: float,
+) -> PhaseAndCode:
+    """Compare places by phase, on any fringe, with the middles of their cells by code.
+
+    Args:
+        position: (P,) projector px by the phase.
+        cells: (P,) projector px, the middle of the cell that the code names.
+        sound: (P,) where both were read.
+        axis: along which.
+        period_px: of the fringes, projector px.
+        cell_px: of a cell of the code, projector px; at most half a period.
+    """
+    chosen = np.flatnonzero(sound)
+    chosen = chosen[:: max(1, chosen.size // SAMPLES)]
+    names, cell = np.unique(np.rint(cells[chosen] / cell_px).astype(np.int64), return_inverse=True)
+    turns = np.exp(2j * np.pi * (position[chosen].astype(np.float64) - cells[chosen]) / period_px)
+    count = np.bincount(cell, minlength=names.size)
+    seen = count >= LEAST_IN_CELL
+    summed = np.bincount(cell, turns.real, names.size) + 1j * np.bincount(cell, turns.imag, names.size)
+    mean = summed[seen] / count[seen]
+    whole = mean.size // CELLS_TOGETHER
+    groups = mean[: whole * CELLS_TOGETHER].reshape(whole, CELLS_TOGETHER).mean(axis=1)
+    return PhaseAndCode(
+        axis=axis,
+        period_px=period_px,
+        groups=np.angle(groups) / (2 * np.pi),
+        shift=float(np.angle(mean.sum()) / (2 * np.pi)),
+        following=float(np.abs(groups).mean() / np.sinc(cell_px / period_px)) if whole else 0.0,
+        cells=int(seen.sum()),
+    )
