@@ -9,7 +9,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +30,10 @@ from scanner.patterns import (
 )
 from scanner.patterns.description import read_numbers
 from scanner.patterns.graypmp import default_gray_pmp
-from scanner.patterns.sequence import Precorrection
+from scanner.patterns.mcp_choice import choose_mcp
 from scanner.sequencer import Rig, measure_latency
 from scanner.wire import ScanStart
+from service.rig_patterns import KnownRig, known_of
 
 _log = logging.getLogger(__name__)
 
@@ -72,6 +72,14 @@ class OpenRig:
         """Size of the projected image."""
         capabilities = self.rig.projector.capabilities
         return ProjectorSize(capabilities.width, capabilities.height)
+
+    @property
+    def known(self) -> KnownRig:
+        """What patterns depend on."""
+        camera = self.rig.camera.capabilities
+        return known_of(
+            self.settings["rig"]["phase_axis"], self.calibration, self.projector, (camera.width, camera.height)
+        )
 
     @property
     def exposure(self) -> float | str | None:
@@ -185,15 +193,13 @@ def sequence_for(opened: OpenRig, params: ScanStart) -> PatternSequence:
     Raises:
         ConfigError: unknown method, or a pattern that contradicts it or does not fit the projector.
     """
-    projector = opened.projector
-    known: Any = opened.calibration.phase_axis if opened.calibration else "y"
-    axis: Axis = opened.settings["rig"]["phase_axis"] or known
+    known = opened.known
     try:
-        pattern = pattern_for(params.method, params.pattern or {}, axis, projector)
+        pattern = pattern_for(params.method, params.pattern or {}, known.axis, known.projector, known.camera_scale)
         check_length(pattern.fringe_count, params.repeat)
         # A position as in a description, or true from the command line: full-on and full-off frames beside the pattern.
         white = isinstance(pattern, McpPattern) and (params.pattern or {}).get("white") not in (None, False)
-        return PatternSequence.bracketed(projector, pattern, _precorrection(opened.calibration), white=white)
+        return PatternSequence.bracketed(known.projector, pattern, known.precorrection, white=white)
     except DecodeError as error:
         raise ConfigError(error.message, hint=error.hint) from error
 
@@ -213,8 +219,14 @@ def check_length(images: int, repeat: int) -> None:
         )
 
 
-def pattern_for(method: str, given: Mapping[str, Any], axis: Axis, projector: ProjectorSize) -> Pattern:
-    """A method's pattern: the given members, the others by default for this projector.
+def pattern_for(
+    method: str,
+    given: Mapping[str, Any],
+    axis: Axis,
+    projector: ProjectorSize,
+    camera_scale: tuple[float, float] | None = None,
+) -> Pattern:
+    """A method's pattern: the given members, the others by default for this projector, and this camera if one is known.
 
     Raises:
         ConfigError: unknown method.
@@ -224,7 +236,9 @@ def pattern_for(method: str, given: Mapping[str, Any], axis: Axis, projector: Pr
         raise ConfigError(f"unknown method {method!r}", hint=f"methods: {', '.join(METHODS)}")
     if given.get("method", method) != method:
         raise ConfigError(f"the pattern is {given['method']!r}, the method {method!r}", hint="leave one of them out")
-    default = default_pattern(method, tuple(given.get("axes") or (axis,)), given.get("axis", axis), projector)
+    default = default_pattern(
+        method, tuple(given.get("axes") or (axis,)), given.get("axis", axis), projector, camera_scale
+    )
     if method == "gray+pmp" and "frequencies" in given:
         default = default_gray_pmp(
             tuple(given.get("axes") or (axis,)), projector, read_numbers(given, "frequencies")[0]
@@ -251,8 +265,14 @@ def _refuse_unknown(method: str, given: Mapping[str, Any], default: Pattern) -> 
         )
 
 
-def default_pattern(method: str, axes: tuple[Axis, ...], axis: Axis, projector: ProjectorSize) -> Pattern:
-    """A method's default pattern on this projector."""
+def default_pattern(
+    method: str,
+    axes: tuple[Axis, ...],
+    axis: Axis,
+    projector: ProjectorSize,
+    camera_scale: tuple[float, float] | None = None,
+) -> Pattern:
+    """A method's default pattern on this projector, seen at this scale if that is known."""
     if method == "pmp":
         return PmpPattern(axes=axes, frequencies=_pmp_frequencies(axes, projector), shifts=(8, 8, 8))
     if method == "gray+pmp":
@@ -262,6 +282,13 @@ def default_pattern(method: str, axes: tuple[Axis, ...], axis: Axis, projector: 
         return GrayPattern(axes=axes, bits=bits, code_bits=bits)
     if method == "cp":
         return _composite(axis, projector)
+    return _mcp(axis, projector, camera_scale)
+
+
+def _mcp(axis: Axis, projector: ProjectorSize, camera_scale: tuple[float, float] | None) -> McpPattern:
+    """The one chosen for the camera; where none is known that of the publications, on a smaller projector less."""
+    if camera_scale is not None:
+        return choose_mcp(projector, axis, camera_scale).pattern
     pattern = McpPattern(axis=axis)
     try:
         pattern.validate(projector)
@@ -312,36 +339,6 @@ def _smaller_mcp(pattern: McpPattern, projector: ProjectorSize) -> McpPattern:
         f"a projector of {projector.width} x {projector.height} is too small for mcp: {problem}",
         hint="use pmp, or give a pattern of your own",
     )
-
-
-def _precorrection(calibration: Calibration | None) -> Precorrection | None:
-    """What undoes the projector's response: its inverse."""
-    response = ((calibration.extra.get("response") or {}) if calibration else {}).get("projector")
-    if not response:
-        return None
-    gamma, table = response.get("gamma"), response.get("table")
-    if gamma is not None:
-        return None if gamma == 1 else Precorrection(gamma=float(gamma))
-    if table is None:
-        return None
-    return Precorrection(table=inverse_table(table))
-
-
-def inverse_table(table: Any) -> tuple[float, ...]:
-    """The input value 0 .. 255 for each light k / 255, from the light 0 .. 1 of each input value.
-
-    Raises:
-        ConfigError: it is no response: not 256 rising numbers.
-    """
-    values = [float(value) for value in table]
-    rising = all(low <= high for low, high in pairwise(values))
-    if len(values) != 256 or not rising or values[0] < 0 or values[-1] > 1 or values[0] == values[-1]:
-        raise ConfigError("calibration: response.projector.table must be 256 rising values of light, 0 .. 1")
-    import numpy as np  # noqa: PLC0415  (of this module's uses the only one)
-
-    # Light that the projector cannot make is given its nearest: np.interp holds the ends. Flat parts keep one value.
-    light, index = np.unique(values, return_index=True)
-    return tuple(float(v) for v in np.interp(np.arange(256) / 255, light, index))
 
 
 def _marks(path: str | None) -> dict[str, Any] | None:

@@ -22,6 +22,11 @@ BLUR_PX = 0.7
 LEAST_MODULATION = 0.58
 """Share of the finest carrier's modulation that blur must leave: at a half its code bits drown where light is weak"""
 
+FINEST = 222.0
+NEAR = 0.01
+"""Cycles of the finest carrier on the rig that figures are published of; within this share of it a rig gets the very
+same carriers, so that it can be compared: focus changes by more"""
+
 RATIOS = (98 / 222, 136 / 222, 185 / 222, 1.0)
 """Carriers relative to the finest: as far apart as an octave and a bit allows, none the sum or double of others
 within a band's width, where a gamma that is not undone would put its harmonics (Casey 2011, fig. 3.28)"""
@@ -89,7 +94,8 @@ def _finest(across: int, scale: float, why: dict[str, str]) -> float:
         f"the finest has a period of {period:.1f} projector and {period * scale:.1f} camera pixels: focused lenses "
         f"({BLUR_PX:g} px) leave it {LEAST_MODULATION:.0%} of its modulation"
     )
-    return across / period
+    finest = across / period
+    return FINEST if abs(finest / FINEST - 1) < NEAR else finest
 
 
 def _bits(along: int, scale: float, why: dict[str, str]) -> int:
@@ -104,7 +110,8 @@ def _bits(along: int, scale: float, why: dict[str, str]) -> int:
 
 
 def _carriers(finest: float, bits: int) -> tuple[float, ...]:
-    return tuple(float(math.floor(finest * ratio)) for ratio in RATIOS[-bits:])
+    # A carrier that is whole but for the last digit of a float is whole.
+    return tuple(float(math.floor(finest * ratio + 1e-6)) for ratio in RATIOS[-bits:])
 
 
 def _codes(bits: int) -> tuple[int, ...]:

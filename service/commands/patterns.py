@@ -24,7 +24,10 @@ from service.commands.options import (
 from service.terminal import print_facts, print_json, progress_lines
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from scanner.patterns import PatternSequence
+    from service.rig_patterns import KnownRig
 
 PATTERN_FILE = "pattern.json"
 DEFAULT_SIZE = "1152x864"
@@ -51,7 +54,12 @@ def patterns(
     levels: Levels = None,
     gamma: Annotated[
         float | None,
-        typer.Option(metavar="G", min=0.1, max=10.0, help="The projector's gamma, corrected for in the images."),
+        typer.Option(
+            metavar="G",
+            min=0.1,
+            max=10.0,
+            help="The projector's gamma, undone in the images. Without it: the rig's with --for, else none.",
+        ),
     ] = None,
     bracketed: Annotated[
         bool, typer.Option("--bracketed", help="With the sentinels and order bars that a scan projects.")
@@ -73,16 +81,15 @@ def patterns(
     """
     from scanner.errors import ScannerError  # noqa: PLC0415
     from scanner.storage import prepare_output, replace_json  # noqa: PLC0415
+    from service.rig_patterns import known_rig  # noqa: PLC0415
 
     members = PatternOptions(frequencies, shifts, axis, bits, carriers, profile, levels).members(method)
     if rig is not None and size is not None:
         raise typer.BadParameter("--size and --for exclude each other: the rig has a size")
     try:
-        why: dict[str, str] = {}
-        projector_size = _size(size or DEFAULT_SIZE)
-        if rig is not None:
-            projector_size, members, why = _for_rig(rig, method, members)
-        sequence = _sequence(method, members, projector_size, gamma, bracketed=bracketed)
+        known = _of_size(size or DEFAULT_SIZE) if rig is None else known_rig(rig)
+        sequence = _sequence(method, members, known, gamma, bracketed=bracketed)
+        why = {} if rig is None else _reasons(known, method, members, gamma)
     except ScannerError as error:
         raise typer.BadParameter(f"{error}{f' ({error.hint})' if error.hint else ''}") from error
     prepare_output(output, force=force)
@@ -109,48 +116,55 @@ def patterns(
     return 0
 
 
-def _size(text: str) -> tuple[int, int]:
+def _of_size(text: str) -> KnownRig:
+    """A projector of which nothing but its size is known."""
+    from scanner.patterns import ProjectorSize  # noqa: PLC0415
+    from service.rig_patterns import KnownRig  # noqa: PLC0415
+
     width, _, height = text.partition("x")
     if not (width.isdecimal() and height.isdecimal() and 2 <= int(width) <= 16_384 and 2 <= int(height) <= 16_384):
         raise typer.BadParameter(f"--size: expected WIDTHxHEIGHT in pixels, 2 .. 16384 each, got {text!r}")
-    return int(width), int(height)
-
-
-def _for_rig(
-    name: str, method: Method, members: dict[str, Any]
-) -> tuple[tuple[int, int], dict[str, Any], dict[str, str]]:
-    """The rig's projector size, the pattern's members, and the reasons of those that were chosen here."""
-    from scanner.patterns.mcp_choice import choose_mcp  # noqa: PLC0415
-    from service.rig_patterns import known_rig  # noqa: PLC0415
-
-    rig = known_rig(name)
-    size = (rig.projector.width, rig.projector.height)
-    if method is not Method.MCP:
-        axes = {"axis": rig.axis} if method is Method.CP else {"axes": [rig.axis]}
-        return size, {**axes, **members}, {"axis": f"{rig.axis}: the projected axis that moves with depth"}
-    choice = choose_mcp(rig.projector, members.get("axis", rig.axis), rig.camera_scale or (1.0, 1.0))
-    chosen = choice.pattern.describe()
-    why = {key: said for key, said in choice.why.items() if key not in members}
-    if rig.camera_scale is None:
-        why["camera"] = "no calibration: taken as one pixel for each of the projector's"
-    return size, {**chosen, **members}, why
+    return KnownRig(ProjectorSize(int(width), int(height)), "y", None, None)
 
 
 def _sequence(
-    method: Method, members: dict[str, Any], size: tuple[int, int], gamma: float | None, *, bracketed: bool
+    method: Method, members: dict[str, Any], known: KnownRig, gamma: float | None, *, bracketed: bool
 ) -> PatternSequence:
     """The sequence to write: the method's images alone, or with those that a scan puts around them."""
-    from scanner.patterns import PatternSequence, ProjectorSize  # noqa: PLC0415
+    from scanner.patterns import PatternSequence  # noqa: PLC0415
     from scanner.patterns.sequence import Precorrection  # noqa: PLC0415
     from service.scan_setup import pattern_for  # noqa: PLC0415
 
-    projector = ProjectorSize(*size)
-    pattern = pattern_for(method.value, members, "y", projector)
-    precorrection = None if gamma is None else Precorrection(gamma=gamma)
+    pattern = pattern_for(method.value, members, known.axis, known.projector, known.camera_scale)
+    precorrection = known.precorrection if gamma is None else Precorrection(gamma=gamma)
     if bracketed:
-        return PatternSequence.bracketed(projector, pattern, precorrection)
-    pattern.validate(projector)
-    return PatternSequence(projector, pattern, precorrection=precorrection)
+        return PatternSequence.bracketed(known.projector, pattern, precorrection)
+    pattern.validate(known.projector)
+    return PatternSequence(known.projector, pattern, precorrection=precorrection)
+
+
+def _reasons(known: KnownRig, method: Method, members: dict[str, Any], gamma: float | None) -> dict[str, str]:
+    """Why the rig's patterns are what they are, by what was chosen and not given."""
+    from scanner.patterns.mcp_choice import choose_mcp  # noqa: PLC0415
+
+    axis = members.get("axis", known.axis)
+    reasons: Mapping[str, str] = {"axis": f"{known.axis}: the projected axis that moves with depth"}
+    if method is Method.MCP and known.camera_scale is not None:
+        reasons = choose_mcp(known.projector, axis, known.camera_scale).why
+    why = {
+        key: said for key, said in reasons.items() if key not in members and not (key == "axis" and "axes" in members)
+    }
+    if gamma is None:
+        why["gamma"] = _gamma_words(known)
+    return why
+
+
+def _gamma_words(known: KnownRig) -> str:
+    correction = known.precorrection
+    if correction is None:
+        return "none is undone: the rig's calibration names no response (fringed calibrate response)"
+    what = "a table" if correction.gamma is None else f"{correction.gamma:g}"
+    return f"{what}, undone in the images: the response in the rig's calibration"
 
 
 def _write_png(path: Path, image: Any) -> None:

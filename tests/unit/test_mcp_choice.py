@@ -9,11 +9,16 @@ import numpy as np
 import pytest
 
 from drivers.simulated.rigs import rig
+from scanner.clock import MonotonicClock
 from scanner.errors import DecodeError
 from scanner.patterns import ProjectorSize
 from scanner.patterns.mcp import McpPattern
 from scanner.patterns.mcp_choice import choose_mcp
+from scanner.wire import ScanStart
 from service.cli import main
+from service.config import load_rig
+from service.rig_patterns import known_of
+from service.scan_setup import METHODS, open_rig, pattern_for, sequence_for
 
 SIZES = [(1152, 864), (1920, 1080), (912, 1140), (1024, 768), (320, 240), (3840, 2160)]
 
@@ -45,8 +50,7 @@ def test_stripes_that_the_camera_cannot_tell_apart_become_fewer():
 def test_the_reference_rigs_get_what_the_default_was_found_to_be():
     calibration = rig("casey2011").calibration
     choice = choose_mcp(ProjectorSize(*calibration.projector.size), "y", calibration.camera_scale)
-    assert choice.pattern.carriers == pytest.approx(McpPattern().carriers, abs=2)
-    assert choice.pattern.codes == McpPattern().codes
+    assert choice.pattern == McpPattern()
 
 
 def test_too_coarse_is_said():
@@ -70,3 +74,30 @@ def test_the_choice_for_a_rig_is_written_and_explained(tmp_path: Path, capsys: p
     assert told["projector"] == {"width": 320, "height": 240}
     assert "camera pixels" in told["why"]["carriers"]
     assert json.loads((tmp_path / "p" / "pattern.json").read_text())["pattern"] == told["pattern"]
+
+
+@pytest.fixture(scope="module")
+def opened():
+    config = load_rig("simulated:quick/board").model_dump(mode="json")
+    rig_opened = open_rig(config, MonotonicClock())
+    yield rig_opened
+    rig_opened.close()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_scan_projects_what_patterns_for_the_rig_writes(method, opened, tmp_path, capsys):
+    words = ["patterns", method, "-o", str(tmp_path / "p"), "--for", "simulated:quick/board", "--bracketed", "--json"]
+    assert main(words) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["pattern"] == json.loads(json.dumps(sequence_for(opened, ScanStart("a", method)).describe()))
+    assert told["pattern"]["precorrection"] is not None
+    assert f"{told['pattern']['precorrection']['gamma']:g}" in told["why"]["gamma"]
+
+
+def test_a_rig_without_a_calibration_is_chosen_for_by_its_devices_sizes():
+    projector = ProjectorSize(1920, 1080)
+    coarse, fine = (known_of("x", None, projector, size) for size in ((640, 480), (3840, 2160)))
+    assert (coarse.axis, coarse.precorrection) == ("x", None)
+    least, most = (max(pattern_for("mcp", {}, "x", projector, known.camera_scale).carriers) for known in (coarse, fine))
+    assert 1080 / least * coarse.camera_scale[1] > 2 / 0.58
+    assert least < most

@@ -8,7 +8,8 @@ import pytest
 from scanner.errors import ConfigError, DecodeError
 from scanner.patterns import McpPattern, PatternSequence, PmpPattern, ProjectorSize
 from scanner.patterns.sequence import Precorrection
-from service.scan_setup import METHODS, check_length, inverse_table, pattern_for
+from service.rig_patterns import inverse_table
+from service.scan_setup import METHODS, check_length, pattern_for
 
 SIZES = [(320, 240), (640, 360), (854, 480), (912, 1140), (1152, 864), (1280, 800), (1920, 1080), (3840, 2160)]
 
