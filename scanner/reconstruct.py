@@ -27,7 +27,7 @@ from scanner.devices import Pixels, Truth
 from scanner.errors import CalibrationError, DecodeError
 from scanner.filters import FilterSettings
 from scanner.geometry import Calibration, load_calibration
-from scanner.patterns import GrayPmpPattern, McpPattern, PatternSequence, PmpPattern
+from scanner.patterns import GrayPattern, GrayPmpPattern, McpPattern, PatternSequence, PmpPattern
 from scanner.ripple_correction import without_ripple
 from scanner.scale_check import require_codes_within, require_geometry
 from scanner.scan import Scan, build_scan
@@ -96,7 +96,11 @@ class Reconstruction:
 
     def _begin(self) -> None:
         self._decoders: dict[int, Decoder] = {0: self._new_decoder(self._observer)}
-        self._repetitions = Repetitions(self._header.repeat, ambiguity_px(self._header.sequence))
+        self._repetitions = Repetitions(
+            self._header.repeat,
+            ambiguity_px(self._header.sequence),
+            quantised=isinstance(self._header.sequence.pattern, GrayPattern),
+        )
         self._failed: dict[int, DecodeError] = {}
         self._slots: dict[int, int | None] = {}
 

@@ -22,6 +22,7 @@ from scanner.geometry import Calibration
 from scanner.patterns import (
     Axis,
     CompositePattern,
+    GrayPattern,
     GrayPmpPattern,
     McpPattern,
     PatternSequence,
@@ -124,8 +125,7 @@ def budget_of(
         return None
     noise_px, noise_mm = float(np.median(px[known])), float(np.median(mm[known]))
     per_px = float(np.median(mm[known] / px[known]))
-    of_repeats = f", mean of {repeat} repetitions" if repeat > 1 else ""
-    noise = Contribution("noise", "random", noise_px, noise_mm, f"median of the points' sigmas{of_repeats}")
+    noise = _of_points(sequence, noise_px, noise_mm, repeat)
     fringes = _fringes(sequence)
     light = [] if fringes is None else [_response(scan, axis), _grey_levels(sequence, axis)]
     method = [says for kind, says in _METHODS.items() if isinstance(sequence.pattern, kind)]
@@ -133,6 +133,16 @@ def budget_of(
     contributions = [_in_mm(cause, per_px) for cause in causes]
     contributions.insert(1, _calibration(scan, calibration, axis))
     return Budget(float(np.median(depth[known])), tuple(contributions))
+
+
+def _of_points(sequence: PatternSequence, px: float, mm: float, repeat: int) -> Contribution:
+    """What the points' own sigmas are: noise of fringes and stripes, or the cells of a code."""
+    if isinstance(sequence.pattern, GrayPattern):
+        # The place of a point within its cell is not measured: anywhere in it alike, and the same in each repetition.
+        says = "a point is told to a cell of the code: rectangular, type B (JCGM 100:2008, 4.3.7); repetition leaves it"
+        return Contribution("quantisation", "systematic", px, mm, says)
+    of_repeats = f", mean of {repeat} repetitions" if repeat > 1 else ""
+    return Contribution("noise", "random", px, mm, f"median of the points' sigmas{of_repeats}")
 
 
 def _fringes(sequence: PatternSequence) -> PmpPattern | None:

@@ -171,7 +171,8 @@ def decode_image(
 
 CAUTION = (
     "first-generation composite pattern: depths are biased by centimetres (72 mm published, Casey 2011, table 5.6), "
-    "and the stated sigma is its random part only"
+    "the stated sigma is its random part only, and confidence (near 1 everywhere) says no more than that the pattern's "
+    "two ends were not taken for one another"
 )
 
 

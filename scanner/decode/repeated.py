@@ -27,14 +27,17 @@ sigma at R = 2, JCGM 100:2008 table E.1, and the median over an image is far bet
 class Repetitions:
     """The mean of the decodings given so far. It keeps sums, not the decodings: memory does not grow with R."""
 
-    def __init__(self, expected: int, ambiguity_px: float | None) -> None:
+    def __init__(self, expected: int, ambiguity_px: float | None, *, quantised: bool = False) -> None:
         """Begin with none.
 
         Args:
             expected: how often the sequence was captured.
             ambiguity_px: projector px by which a value of the wrong fringe or stripe is off; None if there is none.
+            quantised: the decodings' sigma is that of rounding to the cells of a code, the same in each of them:
+                repetition does not make it smaller.
         """
         self._expected = expected
+        self._quantised = quantised
         self._half = np.float32(np.inf if ambiguity_px is None else ambiguity_px / 2)
         self._first: Decoded | None = None
         self._count = 0
@@ -73,7 +76,8 @@ class Repetitions:
         """The mean.
 
         A pixel has a value where more than half of the repetitions gave one, none of them a fringe or stripe away
-        from the others; its sigma is that of the weighted mean. Peaks and stripes are those of the first repetition.
+        from the others; its sigma is that of the weighted mean (of rounding: that of one). Peaks and stripes are those
+        of the first repetition.
 
         Raises:
             ValueError: nothing was added.
@@ -89,7 +93,7 @@ class Repetitions:
             torn |= sums.conflict
         keep = enough & ~torn
         reason = np.where(keep, np.uint8(Reason.VALUE), np.where(enough, np.uint8(Reason.UNWRAP_RISK), self._reason))
-        means = {axis: sums.mean(keep) for axis, sums in self._sums.items()}
+        means = {axis: sums.mean(keep, quantised=self._quantised) for axis, sums in self._sums.items()}
         rows, sigma_rows = means.get("rows", (None, None))
         columns, sigma_columns = means.get("columns", (None, None))
         found = {axis: sums.scatter(keep) for axis, sums in self._sums.items()}
@@ -164,12 +168,12 @@ class _AxisSums:
         self.squares += apart * apart
         self.count += use
 
-    def mean(self, keep: NDArray[np.bool_]) -> tuple[Map, Map]:
+    def mean(self, keep: NDArray[np.bool_], *, quantised: bool) -> tuple[Map, Map]:
         """Weighted mean and its sigma, NaN where not kept."""
         here = keep & (self.weight > 0)
         values, sigmas = np.full_like(self.origin, np.nan), np.full_like(self.origin, np.nan)
         values[here] = self.origin[here] + self.weighted[here] / self.weight[here]
-        sigmas[here] = 1 / np.sqrt(self.weight[here])
+        sigmas[here] = np.sqrt((self.count[here] if quantised else np.float32(1)) / self.weight[here])
         return values, sigmas
 
     def scatter(self, keep: NDArray[np.bool_]) -> Scatter | None:

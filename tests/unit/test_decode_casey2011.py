@@ -376,6 +376,7 @@ def test_the_board_comes_out_with_the_depth_error_of_whole_pixels(board):
     assert 0.5 < np.sqrt((depth[peaks] ** 2).mean()) < 0.8
     assert len(np.unique(index[peaks])) >= 24
     assert np.isfinite(decoded.rows).sum() > 0.9 * len(decoded.peaks)
+    assert any("yardstick" in said and "confidence" in said for said in decoded.warnings)
     assert (decoded.reason[np.isfinite(decoded.rows)] == Reason.VALUE).all()
     assert ((confidence > 0) & (confidence <= 1)).all()
     assert (decoded.confidence[np.isnan(decoded.rows)] == 0).all()

@@ -48,6 +48,14 @@ def test_noise_falls_with_the_root_of_the_count_and_sigma_says_so():
     assert mean.warnings == ()
 
 
+def test_the_cells_of_a_code_are_as_wide_in_the_mean_of_sixteen():
+    random = np.random.default_rng(1)
+    repetitions = Repetitions(16, None, quantised=True)
+    for _ in range(16):
+        repetitions.add(decoding(random))
+    assert repetitions.result().sigma_rows == pytest.approx(np.full(SHAPE, SIGMA), rel=1e-3)
+
+
 @pytest.mark.parametrize("count", [2, 3, 5, 20])
 def test_the_scatter_is_measured_not_believed(count):
     random = np.random.default_rng(2)

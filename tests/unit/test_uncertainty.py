@@ -117,7 +117,9 @@ def test_what_cannot_be_told_is_in_no_sum(scene):
         assert "method" in budget_of(scan_of(scene), scene.calibration, sequence, 0.0).unknown
     found = budget_of(scan_of(scene), scene.calibration, gray, 0.2)
     assert found is not None
-    assert [c.name for c in found.contributions] == ["noise", "calibration", "sync"]
+    assert [c.name for c in found.contributions] == ["quantisation", "calibration", "sync"]
+    assert found.of("random") == 0, "rounding to the cells of a code is no noise"
+    assert found.of("systematic") > 0
     assert found.unknown == ("calibration", "sync")
     nothing = replace(scan_of(scene), xyz=None)
     assert budget_of(nothing, scene.calibration, gray, 0.0) is None

@@ -303,8 +303,15 @@ def _name_peaks(
     return _Named(index, sure, figures)
 
 
+YARDSTICK = (
+    "the published decoder (Casey 2011), a yardstick: nothing is taken out that is not taken out there, so that "
+    "stripes with a wrong name stay, centimetres to decimetres off; its confidence is the posterior of its hidden "
+    "Markov model, which does not know them (leave --decoder out for one that does)"
+)
+
+
 def _warnings(details: dict[str, Any]) -> tuple[str, ...]:
-    said = []
+    said = [YARDSTICK]
     if details["marks"] == 0:
         said.append("stripes and carriers are there, but no stripe could be decided")
     if details["agreement"] < PLAIN_AGREEMENT:
