@@ -68,6 +68,12 @@ class Request(Struct, frozen=True, kw_only=True):
     params: dict[str, Any] = {}
 
 
+class _Called(Request, frozen=True, kw_only=True):
+    """A call as it came: here "jsonrpc" has to be said."""
+
+    jsonrpc: Literal["2.0"]
+
+
 class ErrorBody(Struct, frozen=True):
     """An error: code, message for people, and data {class, device, hint, ...} for programs."""
 
@@ -205,7 +211,7 @@ _T = TypeVar("_T")
 _Params = TypeVar("_Params", bound=Struct)
 
 _encoder = msgspec.msgpack.Encoder()
-_requests = msgspec.msgpack.Decoder(Request)
+_requests = msgspec.msgpack.Decoder(_Called)
 _responses = msgspec.msgpack.Decoder(Response)
 _notifications = msgspec.msgpack.Decoder(Notification)
 
@@ -250,9 +256,14 @@ def decode_request(data: bytes) -> Request:
             hint="see hello's limits",
         )
     try:
-        return _requests.decode(data)
+        called = _requests.decode(data)
+        return Request(id=called.id, method=called.method, params=called.params)
     except msgspec.ValidationError as error:
-        raise Refused(f"not a JSON-RPC 2.0 request: {error}", reason="invalid_request") from error
+        raise Refused(
+            f"not a JSON-RPC 2.0 request: {error}",
+            reason="invalid_request",
+            hint='a map of "jsonrpc": "2.0", id (integer or string), method, and params (a map) where it has any',
+        ) from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise Refused(f"not MessagePack: {error}", reason="malformed") from error
 

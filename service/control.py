@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
@@ -11,7 +12,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from scanner.errors import DeviceBusy, StorageError
+from scanner.errors import DeviceBusy, ScannerError, StorageError
 from scanner.wire import (
     MAX_FETCH_BYTES,
     MAX_MESSAGE_BYTES,
@@ -26,8 +27,13 @@ from scanner.wire import (
     PreviewStart,
     Refused,
     Request,
+    Response,
     ScanStart,
+    decode_request,
+    encode,
+    error_body,
     params_as,
+    request_id,
 )
 from service.devices_link import DevicesLink
 from service.jobs import Job, JobState
@@ -38,6 +44,11 @@ from service.worker_pool import WorkerPool
 
 MAX_CLIENTS = 4096
 """Connections remembered; one that was forgotten says hello again."""
+
+SPOOL_FRESH_S = 1.0
+"""How long `status` says what the spool held when it was last measured."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -74,6 +85,8 @@ class Control:
         self._last_event = last_event
         self._stop = stop
         self._clients: OrderedDict[bytes, str] = OrderedDict()
+        self._measuring: asyncio.Task[int] | None = None
+        self._fresh_until = 0.0
         self._methods: dict[str, Callable[[Request, str], Awaitable[Any]]] = {
             "status": self._status,
             "devices.list": self._list_devices,
@@ -92,6 +105,29 @@ class Control:
             "preview.stop": self._preview_stop,
             "shutdown": self._shutdown,
         }
+
+    async def answer_bytes(self, identity: bytes, body: list[bytes]) -> bytes:
+        """The answer to a call as it came: its parts, of which there should be one. Always answers."""
+        number = request_id(body[0]) if len(body) == 1 else None
+        try:
+            request = decode_request(_only_part(body))
+            return encode(Response(id=request.id, result=await self.answer(identity, request)))
+        except ScannerError as error:
+            return encode(Response(id=number, error=error_body(error)))
+        except Exception as error:  # noqa: BLE001  (one call that fails must not end the daemon)
+            _log.exception("a call failed")
+            problem = ScannerError(f"the daemon failed: {type(error).__name__}: {error}", hint="see its log")
+            return encode(Response(id=number, error=error_body(problem)))
+
+    @staticmethod
+    def refuse_bytes(body: list[bytes], waiting: int) -> bytes:
+        """The answer to a call of somebody of whom `waiting` calls wait already."""
+        error = Refused(
+            f"{waiting} calls of this connection wait already",
+            reason="queue_full",
+            hint="read the answers before calling again",
+        )
+        return encode(Response(id=request_id(body[0]) if len(body) == 1 else None, error=error_body(error)))
 
     async def answer(self, identity: bytes, request: Request) -> Any:
         """A call's result.
@@ -119,6 +155,12 @@ class Control:
 
     def _hello(self, identity: bytes, request: Request) -> dict[str, Any]:
         given = params_as(Hello, request)
+        if min(given.protocol) < 0:
+            raise Refused(
+                f"hello: protocol {list(given.protocol)} is no version",
+                reason="invalid_params",
+                hint=f"[major, minor], as {list(PROTOCOL)}",
+            )
         if given.protocol[0] != PROTOCOL[0]:
             raise Refused(
                 f"the client speaks protocol {list(given.protocol)}, this daemon {list(PROTOCOL)}",
@@ -158,11 +200,19 @@ class Control:
             "waiting_for_worker": self._workers.waiting,
             "jobs": [job.status() for job in self._pipeline.store.unfinished()],
             "spool": {
-                "bytes": await asyncio.to_thread(spool.used),
+                "bytes": await self._spool_bytes(),
                 "limit_bytes": spool.limits.bytes,
                 "min_free_bytes": spool.limits.min_free_bytes,
             },
         }
+
+    async def _spool_bytes(self) -> int:
+        """Measured once for all who ask within SPOOL_FRESH_S: every file of it is looked at."""
+        now = asyncio.get_running_loop().time()
+        if self._measuring is None or (self._measuring.done() and now >= self._fresh_until):
+            self._fresh_until = now + SPOOL_FRESH_S
+            self._measuring = asyncio.create_task(asyncio.to_thread(self._pipeline.spool.used))
+        return await asyncio.shield(self._measuring)
 
     async def _list_devices(self, request: Request, _client: str) -> dict[str, Any]:
         params_as(Nothing, request)
@@ -203,6 +253,8 @@ class Control:
                 reason="invalid_params",
                 hint=f"offset 0 or more, length 1 .. {MAX_FETCH_BYTES}",
             )
+        if given.offset >= entry.bytes:
+            return b""  # also where the file system could not seek so far
         self._pipeline.spool.lease(job.id)
         folder = self._pipeline.spool.folder(job.id)
         inside, _, name = entry.name.rpartition("/")
@@ -273,6 +325,12 @@ class Control:
 
     def _with_number(self, job: Job) -> dict[str, Any]:
         return {"number": self._last_event(), **job.status()}
+
+
+def _only_part(body: list[bytes]) -> bytes:
+    if len(body) != 1:
+        raise Refused(f"a call has one part, not {len(body)}", reason="invalid_request")
+    return body[0]
 
 
 def _piece(path: Path, offset: int, length: int) -> bytes:

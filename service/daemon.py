@@ -30,14 +30,10 @@ from scanner.stream import SILENCE_S as WORKER_SILENCE_S
 from scanner.wire import (
     Event,
     Notification,
-    Refused,
-    Response,
-    decode_request,
     encode,
-    error_body,
-    request_id,
     sibling,
 )
+from service.callers import ANSWERS_HELD, Callers
 from service.control import Control, Endpoints
 from service.devices_link import SILENCE_S as DEVICES_SILENCE_S
 from service.devices_link import DevicesLink
@@ -82,7 +78,6 @@ class Daemon:
         self._number = 0
         self._stopped = asyncio.Event()
         self._notifier = Notifier()
-        self._calls: set[asyncio.Task[None]] = set()
 
     async def run(self, ready: asyncio.Event | None = None) -> None:
         """Serve until `stop`.
@@ -114,7 +109,7 @@ class Daemon:
     async def _serve(
         self, context: zmq.asyncio.Context, store: JobStore, spool: Spool, lock: int, ready: asyncio.Event | None
     ) -> None:
-        self._control = bound(context, zmq.ROUTER, self._endpoints.control)
+        self._control = bound(context, zmq.ROUTER, self._endpoints.control, high_water=ANSWERS_HELD)
         self._events = bound(context, zmq.XPUB, self._endpoints.events)
         router = bound(context, zmq.ROUTER, self._endpoints.worker)
         keep_from_clients(self._endpoints.worker)
@@ -127,7 +122,8 @@ class Daemon:
         control = Control(
             self._config.rig.name, self._endpoints, pipeline, devices, workers, live, lambda: self._number, self.stop
         )
-        serving = [asyncio.create_task(self._listen(control)), asyncio.create_task(self._drain_subscriptions())]
+        callers = Callers(self._control, control.answer_bytes, control.refuse_bytes)
+        serving = [asyncio.create_task(callers.serve()), asyncio.create_task(self._drain_subscriptions())]
         workers.start(self._config.daemon.workers)
         opening = asyncio.create_task(_open_early(devices))
         pipeline.start(live.recover)
@@ -143,7 +139,7 @@ class Daemon:
             self._notifier.ending()
             await live.close()
             await pipeline.close()
-            ended = (*serving, opening, feeding, *self._calls)
+            ended = (*serving, opening, feeding)
             for task in ended:
                 task.cancel()
             await asyncio.gather(*ended, return_exceptions=True)
@@ -157,41 +153,9 @@ class Daemon:
         data = encode(Notification(params=Event(self._number, kind, job, dict(fields))))
         send_now(self._events, [data])
 
-    async def _listen(self, control: Control) -> None:
-        while True:
-            parts = await self._control.recv_multipart()
-            # A REQ socket puts an empty part between address and message; it gets one back.
-            address = parts[:2] if len(parts) > 2 and not parts[1] else parts[:1]
-            task = asyncio.create_task(self._answer(control, address, parts[len(address) :]))
-            self._calls.add(task)
-            task.add_done_callback(self._calls.discard)
-
-    async def _answer(self, control: Control, address: list[bytes], body: list[bytes]) -> None:
-        number = request_id(body[0]) if len(body) == 1 else None
-        try:
-            request = decode_request(_only_part(body))
-            data = encode(Response(id=request.id, result=await control.answer(address[0], request)))
-        except ScannerError as error:
-            data = encode(Response(id=number, error=error_body(error)))
-        except Exception as error:  # noqa: BLE001  (one call that fails must not end the daemon)
-            _log.exception("a call failed")
-            problem = ScannerError(f"the daemon failed: {type(error).__name__}: {error}", hint="see its log")
-            data = encode(Response(id=number, error=error_body(problem)))
-        self._reply(address, data)
-
-    def _reply(self, address: list[bytes], data: bytes) -> None:
-        if not send_now(self._control, [*address, data]):
-            _log.info("a client went away before its answer came")
-
     async def _drain_subscriptions(self) -> None:
         while True:
             await self._events.recv()
-
-
-def _only_part(body: list[bytes]) -> bytes:
-    if len(body) != 1:
-        raise Refused(f"a call has one part, not {len(body)}", reason="invalid_request")
-    return body[0]
 
 
 async def _open_early(devices: DevicesLink) -> None:

@@ -8,6 +8,7 @@ import socket
 import stat
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from enum import Enum
 from pathlib import Path
 from typing import cast
 
@@ -22,14 +23,29 @@ HIGH_WATER = 10_000
 """Messages that wait for one peer; more are refused (ROUTER) or dropped (events), never waited for."""
 
 
-def bound(context: zmq.asyncio.Context, kind: int, endpoint: str) -> zmq.asyncio.Socket:
+class Sent(Enum):
+    """What became of a message."""
+
+    DONE = "done"
+    FULL = "full"
+    """the peer's queue has no room"""
+    GONE = "gone"
+    """the peer is not there any more"""
+
+
+def bound(
+    context: zmq.asyncio.Context, kind: int, endpoint: str, *, high_water: int = HIGH_WATER
+) -> zmq.asyncio.Socket:
     """A socket bound to a local endpoint: folder 0750 if it is made here, socket 0660.
+
+    Args:
+        high_water: messages to one peer that wait in ZeroMQ.
 
     Raises:
         StorageError: the folder cannot be made or written.
     """
     opened = context.socket(kind)
-    options = [(zmq.LINGER, 0), (zmq.SNDHWM, HIGH_WATER), (zmq.RCVHWM, HIGH_WATER), (zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)]
+    options = [(zmq.LINGER, 0), (zmq.SNDHWM, high_water), (zmq.RCVHWM, HIGH_WATER), (zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)]
     if kind == zmq.ROUTER:
         options.append((zmq.ROUTER_MANDATORY, 1))
     for option, value in options:
@@ -110,11 +126,16 @@ def remove_sockets(endpoints: Iterable[str]) -> None:
 
 def send_now(to: zmq.asyncio.Socket, parts: Sequence[bytes]) -> bool:
     """Send without waiting; False where the peer's queue is full or the peer is gone."""
+    return try_send(to, parts) is Sent.DONE
+
+
+def try_send(to: zmq.asyncio.Socket, parts: Sequence[bytes]) -> Sent:
+    """Send without waiting."""
     # With DONTWAIT the future is done when it is returned.
     sent = cast("asyncio.Future[None]", to.send_multipart(parts, zmq.DONTWAIT))
     error = sent.exception()
     if error is None:
-        return True
+        return Sent.DONE
     if isinstance(error, zmq.ZMQError) and error.errno in (zmq.EAGAIN, zmq.EHOSTUNREACH):
-        return False
+        return Sent.FULL if error.errno == zmq.EAGAIN else Sent.GONE
     raise error

@@ -200,7 +200,8 @@ def test_files_are_named_and_never_paths(client: Client) -> None:
     for wrong in ({"offset": -1}, {"length": 0}, {"length": 1 << 30}):
         with pytest.raises(Refused, match="offset"):
             client.call("scan.fetch", id=job, name="scan.npz", **wrong)
-    assert client.call("scan.fetch", id=job, name="scan.npz", offset=1 << 40) == b""
+    for behind in (1 << 40, (1 << 64) - 1):
+        assert client.call("scan.fetch", id=job, name="scan.npz", offset=behind) == b""
     assert client.call("scan.fetch", id=job, name="scan.npz", offset=2, length=2) == b"\x03\x04"
 
 
@@ -253,7 +254,10 @@ def test_another_major_version_is_refused(raw: Any) -> None:
         (b"\xc1\xff", -32700, None),
         (b"", -32700, None),
         ({"jsonrpc": "2.0", "id": 4, "method": 5}, -32600, 4),
+        ({"id": 4, "method": "status"}, -32600, 4),
         ({"jsonrpc": "2.0", "id": 4, "method": "scan.begin"}, -32601, 4),
+        ({"jsonrpc": "2.0", "id": 4, "method": "hello", "params": {"protocol": [1, -1]}}, -32602, 4),
+        ({"jsonrpc": "2.0", "id": 4, "method": "hello", "params": {"protocol": []}}, -32602, 4),
         ({"jsonrpc": "2.0", "id": 4, "method": "hello", "params": {"protocol": "1.0"}}, -32602, 4),
         ({"jsonrpc": "2.0", "id": 4, "method": "hello", "params": {"pad": "x" * MAX_REQUEST_BYTES}}, -32011, None),
     ],

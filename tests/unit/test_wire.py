@@ -86,6 +86,7 @@ def test_preview_round_trip(width: int, height: int, number: int) -> None:
         (msgpack.packb([1, 2]), "invalid_request", -32600),
         (msgpack.packb({"jsonrpc": "2.0", "id": 1}), "invalid_request", -32600),
         (msgpack.packb({"jsonrpc": "1.0", "id": 1, "method": "status"}), "invalid_request", -32600),
+        (msgpack.packb({"id": 1, "method": "status"}), "invalid_request", -32600),
         (msgpack.packb({"jsonrpc": "2.0", "id": None, "method": "status"}), "invalid_request", -32600),
         (NESTED, "malformed", -32700),
         (bytes(wire.MAX_REQUEST_BYTES + 1), "too_large", -32011),
