@@ -5,10 +5,8 @@ process; it opens devices through the registry and takes no frame.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -17,39 +15,13 @@ from scanner.clock import Clock
 from scanner.devices import CameraSettings, Interval, KnowsTemperature, KnowsTruth, ProjectorKind, TriggerMode
 from scanner.errors import ConfigError, DecodeError, DeviceError
 from scanner.geometry import Calibration, load_calibration
-from scanner.patterns import (
-    Axis,
-    CompositePattern,
-    GrayPattern,
-    McpPattern,
-    Pattern,
-    PatternSequence,
-    PmpPattern,
-    ProjectorSize,
-    pattern_from_description,
-)
-from scanner.patterns.description import read_numbers
-from scanner.patterns.graypmp import default_gray_pmp
-from scanner.patterns.mcp_choice import choose_mcp
-from scanner.sequencer import Rig, measure_latency
+from scanner.patterns import McpPattern, PatternSequence, ProjectorSize
+from scanner.sequencer import Rig, auto_exposure, measure_latency
 from scanner.wire import ScanStart
 from service.rig_patterns import KnownRig, known_of
+from service.scan_patterns import check_length, pattern_for
 
 _log = logging.getLogger(__name__)
-
-METHODS = ("pmp", "mcp", "gray", "cp", "gray+pmp")
-
-PMP_FINEST = 64
-"""Cycles of the finest default fringe."""
-
-PMP_LEAST_PERIOD_PX = 8
-"""A default fringe has at least this many projector pixels: four for each half wave, so that it is still a cosine."""
-
-MAX_IMAGES = 1024
-"""Fringe images of one sequence: the projector holds them all, 2 GB of 1920 x 1080."""
-
-MAX_FRAMES = 65_536
-"""Frames of one scan, repetitions included, unless one image stays on: 18 minutes at 60 Hz, and nobody else's turn."""
 
 
 @dataclass
@@ -114,6 +86,42 @@ class OpenRig:
             rig.projector, rig.camera, clock, settings=rig.settings, trigger_mode=rig.trigger_mode
         )
         self.rig = replace(rig, latency=latency, settle=settle)
+
+    def exposure_for(
+        self, clock: Clock, sequence: PatternSequence, given: float | str | None = None
+    ) -> tuple[int, dict[str, Any]]:
+        """The exposure of a scan, ns, and where it comes from, as capture.json has it.
+
+        Args:
+            given: for this scan, microseconds or "auto"; None: as the rig file says, which may leave it to test shots.
+
+        Raises:
+            DeviceError: a device failed.
+            ConfigError: out of bounds, or the camera refuses its settings.
+        """
+        wanted = given if given is not None else self.exposure or "auto"
+        if not isinstance(wanted, str):
+            if not 0 < wanted <= 10_000_000:
+                raise ConfigError(f"exposure {wanted:g} us is outside 0 .. 10 s", hint='give microseconds, or "auto"')
+            return round(wanted * 1000), {"mode": "given", "asked_us": wanted}
+        rig, self.loaded = self.rig, None
+        choice = auto_exposure(
+            rig.projector,
+            rig.camera,
+            clock,
+            sequence,
+            settings=rig.settings,
+            trigger_mode=rig.trigger_mode,
+            latency=rig.latency,
+            settle=rig.settle,
+        )
+        return choice.exposure_ns, {
+            "mode": "auto",
+            "exposure_us": choice.exposure_ns / 1000,
+            "level": choice.level,
+            "note": choice.note,
+            "warning": choice.warning,
+        }
 
     def close(self) -> None:
         """Give the devices back, the projector black last."""
@@ -202,143 +210,6 @@ def sequence_for(opened: OpenRig, params: ScanStart) -> PatternSequence:
         return PatternSequence.bracketed(known.projector, pattern, known.precorrection, white=white)
     except DecodeError as error:
         raise ConfigError(error.message, hint=error.hint) from error
-
-
-def check_length(images: int, repeat: int) -> None:
-    """Refuse a scan that would fill memory, or the day, before an image of it is made.
-
-    Raises:
-        ConfigError: more than MAX_IMAGES, or MAX_FRAMES in all.
-    """
-    if images > MAX_IMAGES:
-        raise ConfigError(f"the pattern has {images} images, more than {MAX_IMAGES}", hint="give fewer shifts")
-    if images > 1 and images * repeat > MAX_FRAMES:
-        raise ConfigError(
-            f"{repeat} repetitions of {images} images are {images * repeat} frames, more than {MAX_FRAMES}",
-            hint="repeat less often, or make several scans",
-        )
-
-
-def pattern_for(
-    method: str,
-    given: Mapping[str, Any],
-    axis: Axis,
-    projector: ProjectorSize,
-    camera_scale: tuple[float, float] | None = None,
-) -> Pattern:
-    """A method's pattern: the given members, the others by default for this projector, and this camera if one is known.
-
-    Raises:
-        ConfigError: unknown method.
-        DecodeError: a member is wrong.
-    """
-    if method not in METHODS:
-        raise ConfigError(f"unknown method {method!r}", hint=f"methods: {', '.join(METHODS)}")
-    if given.get("method", method) != method:
-        raise ConfigError(f"the pattern is {given['method']!r}, the method {method!r}", hint="leave one of them out")
-    default = default_pattern(
-        method, tuple(given.get("axes") or (axis,)), given.get("axis", axis), projector, camera_scale
-    )
-    if method == "gray+pmp" and "frequencies" in given:
-        default = default_gray_pmp(
-            tuple(given.get("axes") or (axis,)), projector, read_numbers(given, "frequencies")[0]
-        )
-    _refuse_unknown(method, given, default)
-    described = {**default.describe(), **given}
-    if method == "pmp" and "frequencies" in given and "shifts" not in given:
-        described["shifts"] = [8] * len(given["frequencies"])
-    return pattern_from_description(described)
-
-
-_OF_SEQUENCES = frozenset({"method", "white", "black", "sentinels", "bars", "precorrection"})
-"""Members of a whole sequence's description, which a scan makes itself: a description may be given back as it was."""
-
-
-def _refuse_unknown(method: str, given: Mapping[str, Any], default: Pattern) -> None:
-    """A misspelt member must not be a scan without it."""
-    known = default.describe().keys()
-    for name in given.keys() - known - _OF_SEQUENCES:
-        near = get_close_matches(str(name), known, n=1)
-        raise ConfigError(
-            f"pattern member {name!r} says nothing to the method {method!r}",
-            hint=f"did you mean {near[0]!r}?" if near else f"its members: {', '.join(sorted(known))}",
-        )
-
-
-def default_pattern(
-    method: str,
-    axes: tuple[Axis, ...],
-    axis: Axis,
-    projector: ProjectorSize,
-    camera_scale: tuple[float, float] | None = None,
-) -> Pattern:
-    """A method's default pattern on this projector, seen at this scale if that is known."""
-    if method == "pmp":
-        return PmpPattern(axes=axes, frequencies=_pmp_frequencies(axes, projector), shifts=(8, 8, 8))
-    if method == "gray+pmp":
-        return default_gray_pmp(axes, projector)
-    if method == "gray":
-        bits = max(math.ceil(math.log2(projector.along(a))) for a in axes)
-        return GrayPattern(axes=axes, bits=bits, code_bits=bits)
-    if method == "cp":
-        return _composite(axis, projector)
-    return _mcp(axis, projector, camera_scale)
-
-
-def _mcp(axis: Axis, projector: ProjectorSize, camera_scale: tuple[float, float] | None) -> McpPattern:
-    """The one chosen for the camera; where none is known that of the publications, on a smaller projector less."""
-    if camera_scale is not None:
-        return choose_mcp(projector, axis, camera_scale).pattern
-    pattern = McpPattern(axis=axis)
-    try:
-        pattern.validate(projector)
-    except DecodeError:
-        return _smaller_mcp(pattern, projector)
-    return pattern
-
-
-def _pmp_frequencies(axes: tuple[Axis, ...], projector: ProjectorSize) -> tuple[float, ...]:
-    least = min(projector.along(axis) for axis in axes)
-    finest = min(PMP_FINEST, max(4, least // PMP_LEAST_PERIOD_PX))
-    # Equal ratios: each step of the unwrapping then has the same margin.
-    return (1.0, float(round(math.sqrt(finest))), float(finest))
-
-
-def _composite(axis: Axis, projector: ProjectorSize) -> CompositePattern:
-    """The published carriers, in proportion to a smaller projector."""
-    pattern = CompositePattern(axis=axis)
-    across = projector.along("x" if axis == "y" else "y")
-    scale = min(1.0, across / 4 / max(pattern.carriers))  # four pixels a period: half of what a projector can show
-    if scale == 1.0:
-        return pattern
-    try:
-        return CompositePattern(axis, tuple(float(int(f * scale)) for f in pattern.carriers))
-    except DecodeError as problem:
-        raise ConfigError(
-            f"a projector of {projector.width} x {projector.height} is too small for cp: {problem}",
-            hint="use pmp, or give carriers of your own",
-        ) from problem
-
-
-def _smaller_mcp(pattern: McpPattern, projector: ProjectorSize) -> McpPattern:
-    """Carriers in proportion to the projector, and as many bits as leave stripes and gaps that can be decoded."""
-    across = projector.along("x" if pattern.axis == "y" else "y")
-    scale = across / 3 / max(pattern.carriers) / 1.6  # the default's own margin below the limit, on 1152 pixels: 1.7
-    carriers = tuple(float(round(carrier * scale)) for carrier in pattern.carriers)
-    problem: DecodeError | None = None
-    for bits in range(pattern.bits, 1, -1):
-        codes = pattern.codes if bits == pattern.bits else tuple(range(1 << bits))
-        try:
-            smaller = replace(pattern, bits=bits, carriers=carriers[-bits:], codes=codes)
-            smaller.validate(projector)
-        except DecodeError as error:
-            problem = error
-            continue
-        return smaller
-    raise ConfigError(
-        f"a projector of {projector.width} x {projector.height} is too small for mcp: {problem}",
-        hint="use pmp, or give a pattern of your own",
-    )
 
 
 def _marks(path: str | None) -> dict[str, Any] | None:

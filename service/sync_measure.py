@@ -16,7 +16,8 @@ from scanner.patterns import PatternSequence
 from scanner.sequencer import measure_latency
 from scanner.sequencer.light import Light, measure_light
 from service.config import RigConfig
-from service.scan_setup import OpenRig, default_pattern, open_rig
+from service.scan_patterns import default_pattern
+from service.scan_setup import OpenRig, open_rig
 
 ROUNDS, MOST_ROUNDS = 3, 6
 """Searches for the light's begin and end, each with flips of its own: their union covers what jitters slowly. More
@@ -31,6 +32,8 @@ class Sync:
     settle: Interval
     refresh_ns: int
     light: Light
+    exposure: dict[str, Any] | None
+    """of the plan: mode "given" with asked_us, or "auto" with what test shots chose; None where there were none"""
     plan: dict[str, Any] | None
     """of a default PMP scan with these values, as capture.json has it; None where nothing works"""
     refused: str | None
@@ -54,6 +57,7 @@ class Sync:
             **self.rig_lines(),
             "refresh_ns": self.refresh_ns,
             "light": vars(self.light),
+            "exposure": self.exposure,
             "plan": self.plan,
             "refused": self.refused,
         }
@@ -87,8 +91,10 @@ def measure_sync(config: RigConfig, clock: Clock, stage: Callable[[str], None]) 
         stage("measuring light")
         rig = opened.rig
         light = measure_light(rig.projector, rig.camera, clock, settings=rig.settings, trigger_mode=rig.trigger_mode)
-        plan, refused = _plan(opened, latency, settle)
-        return Sync(latency, settle, capabilities.refresh_ns, light, plan, refused)
+        opened.rig = replace(opened.rig, latency=latency, settle=settle)
+        stage("choosing the exposure")
+        exposure, plan, refused = _plan(opened, clock)
+        return Sync(latency, settle, capabilities.refresh_ns, light, exposure, plan, refused)
     finally:
         opened.close()
 
@@ -99,13 +105,13 @@ def _union(intervals: list[Interval]) -> Interval:
     return Interval(min(lows), max(i.high_ns for i in intervals))
 
 
-def _plan(opened: OpenRig, latency: Interval, settle: Interval) -> tuple[dict[str, Any] | None, str | None]:
-    pattern = default_pattern("pmp", ("y",), "y", opened.projector)
-    sequence = PatternSequence.bracketed(opened.projector, pattern)
-    rig = replace(opened.rig, latency=latency, settle=settle)
+def _plan(opened: OpenRig, clock: Clock) -> tuple[dict[str, Any] | None, dict[str, Any] | None, str | None]:
+    """The exposure and the plan that a default PMP scan of this rig gets, as it chooses them itself; or why none."""
+    known, exposure = opened.known, None
+    pattern = default_pattern("pmp", (known.axis,), known.axis, known.projector)
+    sequence = PatternSequence.bracketed(known.projector, pattern, known.precorrection)
     try:
-        asked = opened.exposure
-        exposure_ns = round(1000 * asked) if isinstance(asked, int | float) else None
-        return rig.plan(sequence, exposure_ns=exposure_ns).as_dict(), None
+        exposure_ns, exposure = opened.exposure_for(clock, sequence)
+        return exposure, opened.rig.plan(sequence, exposure_ns=exposure_ns).as_dict(), None
     except ScannerError as error:
-        return None, f"{error}{f' ({error.hint})' if error.hint else ''}"
+        return exposure, None, f"{error}{f' ({error.hint})' if error.hint else ''}"

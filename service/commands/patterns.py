@@ -133,7 +133,7 @@ def _sequence(
     """The sequence to write: the method's images alone, or with those that a scan puts around them."""
     from scanner.patterns import PatternSequence  # noqa: PLC0415
     from scanner.patterns.sequence import Precorrection  # noqa: PLC0415
-    from service.scan_setup import pattern_for  # noqa: PLC0415
+    from service.scan_patterns import pattern_for  # noqa: PLC0415
 
     pattern = pattern_for(method.value, members, known.axis, known.projector, known.camera_scale)
     precorrection = known.precorrection if gamma is None else Precorrection(gamma=gamma)

@@ -13,7 +13,7 @@ from scanner.carrier_check import fit_carriers, require_carriers
 from scanner.decode import decoder_for
 from scanner.errors import DecodeError
 from scanner.patterns import McpPattern, PatternSequence
-from service.scan_setup import pattern_for
+from service.scan_patterns import pattern_for
 from tests.unit.sequencer_bench import QUICK, take
 
 CALIBRATION = rig("quick").calibration

@@ -26,7 +26,7 @@ from scanner.patterns import (
 from scanner.patterns.sequence import Precorrection
 from scanner.scan import load_scan
 from service import cli
-from service.scan_setup import pattern_for
+from service.scan_patterns import pattern_for
 
 SIZE = ProjectorSize(480, 320)
 SMALL = CompositePattern(carriers=(20.0, 40.0, 60.0, 80.0))
@@ -214,6 +214,21 @@ def test_what_is_not_the_pattern_described_is_refused():
         composite.CompositeDecoder(PatternSequence(SIZE, replace(coded, bits=4)), CAMERA)
     with pytest.raises(DecodeError, match="no decoder 'casey2011' for method 'cp'"):
         decoder_for(PatternSequence(SIZE, SMALL), CAMERA, "casey2011")
+
+
+@pytest.mark.parametrize("left_out", SMALL.carriers)
+def test_a_carrier_that_the_description_leaves_out_is_named(left_out):
+    described = CompositePattern(carriers=tuple(f for f in SMALL.carriers if f != left_out))
+    # Two of the four cases have no three carriers in these proportions elsewhere in the spectrum to be taken for them.
+    with pytest.raises(DecodeError, match=f"that the description does not have: {left_out:.0f} cycles"):
+        decode(seen(), described)
+
+
+@pytest.mark.parametrize("gamma", [0.7, 1.4])
+def test_overtones_of_a_wrong_gamma_are_no_further_carriers(gamma):
+    light = SMALL.fringe(0, SIZE)
+    image = np.rint(10 + 200 * light**gamma + np.random.default_rng(0).normal(0, 1, light.shape)).astype(np.uint8)
+    assert np.isfinite(decode(image).rows).mean() > 0.5
 
 
 def test_mosaics_become_grey():

@@ -21,7 +21,7 @@ from scanner.patterns import (
 from scanner.patterns.graypmp import default_gray_pmp
 from scanner.sequencer.thumbnail import thumbnail
 from scanner.sequencer.witness import witness
-from service.scan_setup import pattern_for
+from service.scan_patterns import pattern_for
 
 PROJECTOR = ProjectorSize(320, 240)
 CAMERA = CameraFormat(260, 200)

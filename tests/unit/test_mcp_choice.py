@@ -18,7 +18,8 @@ from scanner.wire import ScanStart
 from service.cli import main
 from service.config import load_rig
 from service.rig_patterns import known_of
-from service.scan_setup import METHODS, open_rig, pattern_for, sequence_for
+from service.scan_patterns import METHODS, pattern_for
+from service.scan_setup import open_rig, sequence_for
 
 SIZES = [(1152, 864), (1920, 1080), (912, 1140), (1024, 768), (320, 240), (3840, 2160)]
 

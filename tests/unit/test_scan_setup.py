@@ -9,7 +9,7 @@ from scanner.errors import ConfigError, DecodeError
 from scanner.patterns import McpPattern, PatternSequence, PmpPattern, ProjectorSize
 from scanner.patterns.sequence import Precorrection
 from service.rig_patterns import inverse_table
-from service.scan_setup import METHODS, check_length, pattern_for
+from service.scan_patterns import METHODS, check_length, pattern_for
 
 SIZES = [(320, 240), (640, 360), (854, 480), (912, 1140), (1152, 864), (1280, 800), (1920, 1080), (3840, 2160)]
 
@@ -83,6 +83,22 @@ def test_a_member_that_says_nothing_is_refused(method: str, given: dict[str, obj
     with pytest.raises(ConfigError, match="says nothing") as caught:
         pattern_for(method, given, "y", ProjectorSize(1152, 864))
     assert says in (caught.value.hint or "")
+
+
+@pytest.mark.parametrize(
+    ("method", "given", "says"),
+    [
+        ("pmp", {"axes": 5}, '"axes"'),
+        ("pmp", {"axes": ["q"]}, '"axes"'),
+        ("mcp", {"axis": 5}, '"axis"'),
+        ("pmp", {"frequencies": 8}, '"frequencies"'),
+        ("gray+pmp", {"frequencies": ["many"]}, '"frequencies"'),
+        ("gray", {"bits": 1.5}, '"bits"'),
+    ],
+)
+def test_a_member_of_the_wrong_kind_is_refused_by_name(method: str, given: dict[str, object], says: str) -> None:
+    with pytest.raises(DecodeError, match=says):
+        pattern_for(method, given, "y", ProjectorSize(1152, 864))
 
 
 def test_a_description_may_be_given_back_as_it_was_written() -> None:
