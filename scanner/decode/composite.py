@@ -49,6 +49,11 @@ BAND_CONTRAST = 2.5
 """Least ratio of the weakest carrier's band to the median between bands, in power: noise and other patterns stay below
 1.7, the reference scenes lie above 9, but for a strong texture of the carriers' own periods, which is refused."""
 
+OTHER_CONTRAST = 8.0
+OTHER_SHARE = 0.15
+"""A wave that is none of the carriers is one that the description left out, if its power is that much above both its
+sides and that share of the weakest carrier's. Overtones of a wrong gamma stay below a twentieth."""
+
 LEAST_SHARE = 0.05
 """Of the image's 99th percentile of modulation: what lies below is a band-pass's skirt, or shadow."""
 
@@ -184,11 +189,13 @@ class Carriers:
     """frequencies: (N,) cycles per camera px, in the pattern's order. scale: of those over the projected ones.
 
     contrast: power of the weakest carrier's band over the median between bands.
+    others: further waves that stand out like carriers, cycles per projector field.
     """
 
     frequencies: NDArray[np.float64]
     scale: float
     contrast: float
+    others: tuple[float, ...] = ()
 
 
 def find_carriers(grey: Map, projected: NDArray[np.float64]) -> Carriers:
@@ -227,7 +234,25 @@ def find_carriers(grey: Map, projected: NDArray[np.float64]) -> Carriers:
     floor = float(np.median(power[low:high]))
     contrast = float(min(strength)) / floor if floor > 0 else 0.0
     frequencies = np.array(found) / width
-    return Carriers(frequencies, float((frequencies / projected).mean()), contrast)
+    captured = float((frequencies / projected).mean())
+    others = _other_waves(power, np.array(found), min(strength))
+    return Carriers(frequencies, captured, contrast, tuple(float(k / width / captured) for k in others))
+
+
+def _other_waves(power: NDArray[np.float64], carriers: NDArray[np.float64], weakest: float) -> NDArray[np.intp]:
+    """Bins of waves that stand out between, below and above the carriers (bins), by both their sides."""
+    separation = float(np.diff(np.sort(np.concatenate(([0.0], carriers)))).min())
+    near, far = int(0.15 * separation), int(0.4 * separation) + 1
+    bins = np.arange(max(far, int(0.3 * separation)), len(power) - far)
+    if far - near < 2 or not bins.size:
+        return np.zeros(0, np.intp)
+    sides = np.median(np.lib.stride_tricks.sliding_window_view(power, far - near), axis=1)
+    beside = np.maximum(sides[bins - far], sides[bins + near])
+    apart = np.abs(bins[:, None] - carriers).min(axis=1) > 0.3 * separation
+    crest = (power[bins] >= power[bins - 1]) & (power[bins] >= power[bins + 1])
+    stands_out = (power[bins] > OTHER_CONTRAST * beside) & (power[bins] > OTHER_SHARE * weakest)
+    found: NDArray[np.intp] = bins[apart & crest & stands_out]
+    return found
 
 
 def envelopes(grey: Map, frequencies: NDArray[np.float64], sigma: float) -> Map:
@@ -293,8 +318,15 @@ def _refuse_flat(grey: Map, camera: CameraFormat) -> None:
 
 
 def _refuse_carriers(search: Carriers, grey: Map, pattern: CompositePattern) -> None:
-    """Raise DecodeError unless all carriers stand out in their proportions; a turned pattern is named."""
+    """Raise DecodeError unless all carriers stand out in their proportions, and no others do; a turned pattern is
+    named."""
     if _match(search, pattern):
+        if search.others:
+            raise DecodeError(
+                f"carriers stand out that the description does not have: {', '.join(f'{f:.0f}' for f in search.others)}"
+                " cycles per field",
+                hint='compare the description\'s "carriers" with those projected',
+            )
         return
     if _match(find_carriers(np.ascontiguousarray(grey.T), np.asarray(pattern.carriers)), pattern):
         raise DecodeError(

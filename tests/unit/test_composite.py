@@ -219,7 +219,6 @@ def test_what_is_not_the_pattern_described_is_refused():
 @pytest.mark.parametrize("left_out", SMALL.carriers)
 def test_a_carrier_that_the_description_leaves_out_is_named(left_out):
     described = CompositePattern(carriers=tuple(f for f in SMALL.carriers if f != left_out))
-    # Two of the four cases have no three carriers in these proportions elsewhere in the spectrum to be taken for them.
     with pytest.raises(DecodeError, match=f"that the description does not have: {left_out:.0f} cycles"):
         decode(seen(), described)
 
