@@ -17,7 +17,7 @@ from scanner.clock import Clock
 from scanner.devices import Image, KnowsTruth
 from scanner.errors import ConfigError, DeviceLost, ScannerError, StorageError
 from scanner.patterns import CameraFormat
-from scanner.sequencer import Acquisition, FinishReason, Plan, acquire, auto_exposure
+from scanner.sequencer import Acquisition, FinishReason, Plan, acquire
 from scanner.storage import replace_json, storage_errors
 from scanner.stream import EndReason
 from scanner.wire import ScanStart, error_body
@@ -75,7 +75,7 @@ class Scan:
         if len(self._sequence) > 1:
             self._opened.measure_latency(self._clock)
         rig = self._opened.rig
-        exposure_ns = self._exposure_ns()
+        exposure_ns, self._exposure = self._opened.exposure_for(self._clock, self._sequence, params.exposure)
         self._plan: Plan = rig.plan(self._sequence, exposure_ns=exposure_ns, **self._plan_options())
         capabilities = rig.camera.capabilities
         self._format = CameraFormat(capabilities.width, capabilities.height, capabilities.bits, capabilities.mosaic)
@@ -177,37 +177,6 @@ class Scan:
             opened.loaded = self._sequence
         return outcome
 
-    def _exposure_ns(self) -> int | None:
-        given = self._params.exposure
-        wanted = given if given is not None else self._opened.exposure or "auto"
-        if isinstance(wanted, str):
-            return self._auto_exposure_ns()
-        if not 0 < wanted <= 10_000_000:
-            raise ConfigError(f"exposure {wanted:g} us is outside 0 .. 10 s", hint='give microseconds, or "auto"')
-        self._exposure = {"mode": "given", "asked_us": wanted}
-        return round(wanted * 1000)
-
-    def _auto_exposure_ns(self) -> int:
-        rig, self._opened.loaded = self._opened.rig, None
-        choice = auto_exposure(
-            rig.projector,
-            rig.camera,
-            self._clock,
-            self._sequence,
-            settings=rig.settings,
-            trigger_mode=rig.trigger_mode,
-            latency=rig.latency,
-            settle=rig.settle,
-        )
-        self._exposure = {
-            "mode": "auto",
-            "exposure_us": choice.exposure_ns / 1000,
-            "level": choice.level,
-            "note": choice.note,
-            "warning": choice.warning,
-        }
-        return choice.exposure_ns
-
     def _write_truth(self) -> None:
         camera = self._opened.rig.camera
         if not self._params.compare_truth or not isinstance(camera, KnowsTruth):
@@ -222,6 +191,6 @@ def _check_filters(params: ScanStart) -> None:
     """Refuse filters that make no sense before anything moves; the worker applies them."""
     given = to_builtins(params.filters)
     if given:
-        from scanner.filters import FilterSettings  # noqa: PLC0415  (brings the kernels; most scans give no filter)
+        from scanner.filter_settings import FilterSettings  # noqa: PLC0415  (brings the kernels; most scans give no filter)
 
         FilterSettings.from_dict(given)

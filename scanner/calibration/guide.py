@@ -23,6 +23,8 @@ TILTED_DEG = 12.0
 WANTED_TILT = "by 20 to 30 degrees"
 DEPTH_SHARE = 0.075
 """To be nearer and farther than the first pose, of its depth: 15 % in all, as the how-to asks"""
+DEPTH_MARGIN = 0.025
+"""What a hand is asked for beyond that"""
 NEW_SHARE = 0.02
 """Of the picture's width by which points must differ on average from every earlier pose's: twice what the solve takes
 for one pose. A tilt alone, about the target's middle, moves them by no more than two or three per cent."""
@@ -123,23 +125,28 @@ class Guide:
         fewest = min(counts.values())
         if fewest >= 1 + (len(self.poses) >= GOOD_POSES // 2):
             return None
+        again = " once more, elsewhere in the picture" if fewest else ""
         opposite = dict(zip(SIDES, ("right", "left", "bottom", "top"), strict=True))
         last = standings[-1]
         other = opposite[last.nearer]
         if last.tilt_deg >= TILTED_DEG and counts[other] == fewest:
-            return f"tilt it the other way: its {other} towards the camera, {WANTED_TILT}"
+            return f"tilt it the other way{again}: its {other} towards the camera, {WANTED_TILT}"
         side = next(side for side in SIDES if counts[side] == fewest)
-        return f"tilt it: its {side} towards the camera, {WANTED_TILT}"
+        return f"tilt it{again}: its {side} towards the camera, {WANTED_TILT}"
 
     def _depth_wanted(self) -> str | None:
         depths = np.array([s.depth for s in self.standings])
         share = depths / depths[0] - 1
-        if share.max() - share.min() >= 2 * DEPTH_SHARE:
+        nearest, farthest, now = float(share.min()), float(share.max()), float(share[-1])
+        if farthest - nearest >= 2 * DEPTH_SHARE:
             return None
-        now = float(share[-1])
-        if share.min() > -DEPTH_SHARE:
-            return f"bring it nearer by {max(now + DEPTH_SHARE + 0.025, 0.05):.0%}"
-        return f"take it farther by {max(DEPTH_SHARE + 0.025 - now, 0.05):.0%}"
+        # As far to both sides of the first pose; where one side has been reached, the whole range from the other.
+        near = farthest - 2 * DEPTH_SHARE if nearest <= -DEPTH_SHARE else max(-DEPTH_SHARE, farthest - 2 * DEPTH_SHARE)
+        far = nearest + 2 * DEPTH_SHARE if farthest >= DEPTH_SHARE else min(DEPTH_SHARE, nearest + 2 * DEPTH_SHARE)
+        nearer, farther = now - near, far - now
+        if nearer <= farther:
+            return f"bring it nearer by {max(nearer + DEPTH_MARGIN, 0.05):.0%}"
+        return f"take it farther by {max(farther + DEPTH_MARGIN, 0.05):.0%}"
 
     def _place_wanted(self) -> str | None:
         covered = self.fields()

@@ -23,6 +23,8 @@ def sync(
 ) -> int:
     """Measure a rig's latency, settling, pulsed greys and flicker, and say what a scan will do with them.
 
+    Lines that begin with "plan" are those of a default PMP scan: its exposure is found by the same test shots.
+
     The projector shows black, white and greys; let it light something the camera sees. With latency and settling in
     the rig file no scan has to measure them again, and frames can be proved.
 
@@ -78,6 +80,8 @@ def _facts(found: Sync) -> list[tuple[str, Any]]:
         ("flicker", f"{light.flicker:.2%} of white from frame to frame"),
         ("contrast", f"black {light.black:.0f}, white {light.white:.0f} at {light.exposure_ns / 1e6:.2f} ms"),
     ]
+    if found.exposure is not None and found.exposure["mode"] == "auto":
+        facts.append(("test shots", found.exposure["note"]))
     if plan is not None:
         facts += [(f"plan: {key.removesuffix('_ns')}", why) for key, why in plan["why"].items()]
     return facts

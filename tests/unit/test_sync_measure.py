@@ -8,8 +8,10 @@ import pytest
 
 from scanner.clock import VirtualClock
 from scanner.errors import ConfigError, StorageError
+from scanner.wire import ScanStart
 from service.config import RigConfig, load_rig, simulated_rig
 from service.rig_file_edit import set_values
+from service.scan_setup import open_rig, sequence_for
 from service.sync_measure import Sync, measure_sync
 
 RIG = """# my rig
@@ -42,6 +44,17 @@ def test_the_measured_latency_holds_the_true_one(latency_us: int) -> None:
     low, high = found.rig_lines()["latency_us"]
     assert 1000 * low <= found.latency.low_ns
     assert 1000 * high >= found.latency.high_ns
+
+
+def test_the_exposure_it_tells_is_the_one_that_a_scan_then_chooses() -> None:
+    found = measured("quick/board")
+    clock = VirtualClock()
+    opened = open_rig(simulated_rig("quick/board").model_dump(mode="json"), clock)
+    chosen_ns, told = opened.exposure_for(clock, sequence_for(opened, ScanStart("a")))
+    opened.close()
+    assert found.exposure == told
+    assert found.plan is not None
+    assert found.plan["exposure_ns"] == pytest.approx(chosen_ns, rel=1e-3)
 
 
 def test_what_cannot_work_is_told_in_words() -> None:
