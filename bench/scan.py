@@ -22,7 +22,8 @@ import numpy as np
 from scanner.compare import compare
 from scanner.decode import Decoded
 from scanner.devices import Truth
-from scanner.filters import FilterSettings, apply_filters
+from scanner.filter_settings import FilterSettings
+from scanner.filters import apply_filters
 from scanner.geometry import Calibration, Lens
 from scanner.normals import normals_of
 from scanner.npz import write_npz

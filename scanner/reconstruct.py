@@ -25,7 +25,7 @@ from scanner.decode.repeated import Repetitions
 from scanner.decode.stages import Observer
 from scanner.devices import Pixels, Truth
 from scanner.errors import CalibrationError, DecodeError
-from scanner.filters import FilterSettings
+from scanner.filter_settings import FilterSettings
 from scanner.geometry import Calibration, load_calibration
 from scanner.patterns import GrayPattern, GrayPmpPattern, McpPattern, PatternSequence, PmpPattern
 from scanner.ripple_correction import without_ripple

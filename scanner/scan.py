@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Reason
 from scanner.errors import StorageError
-from scanner.filters import FilterSettings, apply_filters
+from scanner.filter_settings import FilterSettings
+from scanner.filters import apply_filters
 from scanner.geometry import Calibration
 from scanner.normals import normals_of
 from scanner.npz import read_npz, write_npz

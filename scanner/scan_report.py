@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scanner.decode import Decoded, Reason
 from scanner.decode.reasons import tally
 from scanner.errors import StorageError
-from scanner.filters import FilterSettings
+from scanner.filter_settings import FilterSettings
 from scanner.geometry import Calibration
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import numpy as np
 from scanner.colours import BACKGROUND, text
 from scanner.decode import decoder_for
 from scanner.decode.stages import Stage
-from scanner.filters import FilterSettings
+from scanner.filter_settings import FilterSettings
 from scanner.patterns import McpPattern, ProjectorSize
 from scanner.render import View, render
 from scanner.scan import build_scan

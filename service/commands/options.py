@@ -206,7 +206,7 @@ def filter_members(
         members["min_confidence"] = min_confidence
     if depth is None and box is None:
         return members
-    from scanner.filters import parse_box, parse_depth  # noqa: PLC0415  (loads array libraries)
+    from scanner.filter_settings import parse_box, parse_depth  # noqa: PLC0415
 
     try:
         if depth is not None:

@@ -11,7 +11,7 @@ import pytest
 from scanner.compare import Errors, compare, inside
 from scanner.devices import Truth
 from scanner.errors import DecodeError
-from scanner.filters import FilterSettings
+from scanner.filter_settings import FilterSettings
 from scanner.scan import build_scan
 
 KEEP_ALL = FilterSettings(edges=False)

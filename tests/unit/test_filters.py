@@ -11,15 +11,8 @@ import numpy as np
 import pytest
 
 from scanner.errors import ConfigError
-from scanner.filters import (
-    NOISE_SIGMAS,
-    FilterSettings,
-    apply_filters,
-    at_depth_edge,
-    noise_factor,
-    parse_box,
-    parse_depth,
-)
+from scanner.filter_settings import FilterSettings, parse_box, parse_depth
+from scanner.filters import NOISE_SIGMAS, apply_filters, at_depth_edge, noise_factor
 from scanner.fragments import small_fragments
 from scanner.triangulation import triangulate
 

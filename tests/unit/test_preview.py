@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scanner.colours import PANEL, Scale, fit, grouped, scale_of, text, text_width, ticks
-from scanner.filters import FilterSettings
+from scanner.filter_settings import FilterSettings
 from scanner.preview import preview_picture
 from scanner.render import View, render
 from scanner.scan import build_scan

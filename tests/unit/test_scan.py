@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as hnp
 from scanner import scan as scan_module
 from scanner.decode import Reason
 from scanner.errors import CalibrationError, StorageError
-from scanner.filters import FilterSettings
+from scanner.filter_settings import FilterSettings
 from scanner.npz import read_npz, write_npz
 from scanner.scan import build_scan, load_scan
 
