@@ -40,10 +40,10 @@ class Fit:
     cycles: Array
     """(P,) theta / 2 pi"""
 
-    def model(self, n: int) -> Array:
-        """(P,) what frame n should show."""
-        angle = 2 * np.pi * self.cycles + np.float32(self.alpha[n])
-        return np.asarray(self.mean + self.modulation * np.cos(angle), dtype=np.float32)
+    def model(self, where: NDArray[np.intp]) -> Array:
+        """(N, p) what the frames should show at some samples."""
+        angles = 2 * np.pi * self.cycles[where] + self.alpha.astype(np.float32)[:, None]
+        return np.asarray(self.mean[where] + self.modulation[where] * np.cos(angles), dtype=np.float32)
 
 
 def fit_set(scene: Scene, pattern: PmpPattern, fringe_set: FringeSet) -> Fit | None:
@@ -104,7 +104,9 @@ def disorder(fit: Fit, use: NDArray[np.bool_]) -> tuple[float, tuple[int, ...]] 
     frames, b = fit.frames[:, use], fit.modulation[use]
     left = (frames - design @ solve(design_matrix(fit.alpha), frames)) / b
     turns = fit.cycles[use][None, :] + (fit.alpha / (2 * np.pi)).astype(np.float32)[:, None]
-    index = ((turns % 1.0) * PHASE_BINS).astype(np.intp) % PHASE_BINS
+    turns -= np.floor(turns)  # a remainder by division takes a hundred times as long
+    index = (turns * PHASE_BINS).astype(np.intp)
+    index[index == PHASE_BINS] = 0
     members = np.stack([np.bincount(row, minlength=PHASE_BINS) for row in index])
     if members.min() < MIN_IN_BIN:
         return None

@@ -18,8 +18,8 @@ from scanner.errors import DecodeError
 from scanner.patterns import PmpPattern
 from scanner.patterns.description import Axis
 from scanner.patterns.sequence import BAR_COUNT, bar_light
-from scanner.sequencer.findings import Array, Scene, Witness
-from scanner.sequencer.fringe_fit import MIN_PIXELS, Fit, bright_pixels, mean_vector
+from scanner.sequencer.findings import Array, Scene, Witness, middle
+from scanner.sequencer.fringe_fit import MIN_PIXELS, Fit, mean_vector
 
 LEAST_OFFSET = 0.05
 """Mean remainder, in fringes, that is allowed in any case: interreflections and slow drift of the lamp."""
@@ -51,19 +51,22 @@ def order_witnesses(
     scene: Scene,
     pattern: PmpPattern,
     axis: Axis,
-    fits: Sequence[Fit],
-    clipped: NDArray[np.bool_],
+    bright: Sequence[tuple[Fit, NDArray[np.bool_]]],
     suspected: set[int],
     cannot: list[str],
 ) -> list[Witness]:
-    """Question one axis. fits: its sets. suspected: positions that other witnesses accuse already."""
+    """Question one axis.
+
+    bright: its sets, and where each is well seen (`bright_pixels`). suspected: positions that others accuse already.
+    """
+    fits = [fit for fit, _ in bright]
     if len(fits) < len(pattern.frequencies) or not fits:
         cannot.append(f"rotations of sets along {axis} (sets are missing)")
         return []
     if suspected & {p for fit in fits for p in fit.positions}:
         # Phases of a set with a foreign frame prove nothing against other sets.
         return []
-    use = np.logical_and.reduce([bright_pixels(scene, fit, clipped) for fit in fits])
+    use = np.logical_and.reduce([pixels for _, pixels in bright])
     if np.count_nonzero(use) < MIN_PIXELS:
         cannot.append(f"rotations and reversals of sets along {axis} (too few pixels show all of them)")
         return []
@@ -74,9 +77,10 @@ def order_witnesses(
         return []
     cycles = np.stack([fit.cycles[use].astype(np.float64) for fit in fits])
     centre = 0.5 + (pattern.origin - 0.5) / scene.sequence.projector.along(axis)
-    items = _remainders(scene, pattern, fits, ladder, cycles, use, centre, cannot)
+    vectors = _agreement(ladder, cycles, centre)
+    items = _remainders(scene, pattern, fits, ladder, cycles, vectors, use, centre, cannot)
     if all(item.passed for item in items):
-        items += _bars(scene, pattern, axis, fits, ladder, cycles, use, centre, cannot)
+        items += _bars(scene, pattern, axis, fits, ladder, cycles, vectors, use, centre, cannot)
     return items
 
 
@@ -103,6 +107,7 @@ def _remainders(
     fits: Sequence[Fit],
     ladder: Ladder,
     cycles: NDArray[np.float64],
+    vectors: NDArray[np.complex128],
     use: NDArray[np.bool_],
     centre: float,
     cannot: list[str],
@@ -112,10 +117,11 @@ def _remainders(
         if not scene.sequence.bars:
             cannot.append("a rotation or reversal of the only set (no other frequency, no bars)")
         return []
-    vectors = _agreement(ladder, cycles, centre)
     shifts = [fit.fringe_set.shifts for fit in fits]
-    best, turned = _best_turn(pattern, ladder, cycles, centre, shifts)
     score = float(vectors.real.mean())
+    # No set is turned to find a better agreement than there can be.
+    could_be = score + HYPOTHESIS_GAIN < 1
+    best, turned = _best_turn(pattern, ladder, cycles, centre, shifts) if could_be else (score, ())
     axis = fits[0].fringe_set.axis
     if turned and best > score + HYPOTHESIS_GAIN:
         frames = tuple(sorted(p for k in turned for p in fits[k].positions))
@@ -124,11 +130,12 @@ def _remainders(
         return [Witness(f"remainder {axis}", False, score, best - HYPOTHESIS_GAIN, frames, says)]
     noise2 = [(scene.noise / float(np.median(fit.modulation[use]))) ** 2 * 2 / n / (4 * np.pi**2)
               for fit, n in zip(fits, shifts, strict=True)]  # fmt: skip
+    lengths = [mean_vector(fit, use) for fit in fits]
     items = []
     for j, (errors, vector) in enumerate(zip(ladder.errors, vectors, strict=True)):
         concerned = [k for k, weight in enumerate(errors) if abs(weight) > 1e-9]
         expected = float(np.exp(-2 * np.pi**2 * np.sum(errors**2 * noise2)))
-        varied = all(mean_vector(fits[k], use) < 0.5 for k in concerned)
+        varied = all(lengths[k] < 0.5 for k in concerned)
         items.append(_step(fits, ladder, j, vector, expected, concerned, varied, cannot))
     return items
 
@@ -209,6 +216,7 @@ def _bars(
     fits: Sequence[Fit],
     ladder: Ladder,
     cycles: NDArray[np.float64],
+    vectors: NDArray[np.complex128],
     use: NDArray[np.bool_],
     centre: float,
     cannot: list[str],
@@ -220,14 +228,14 @@ def _bars(
         cannot.append(f"{blind} (no order bars)")
         return []
     b = np.min([fit.modulation[use] for fit in fits], axis=0)
-    fraction, sigma = _trusted(scene, fits, ladder, cycles, centre, b)
+    fraction, sigma = _trusted(scene, fits, ladder, cycles, np.abs(vectors), centre, b)
     bar = (fraction - (pattern.origin - 0.5) / scene.sequence.projector.along(axis)) * BAR_COUNT
     known = sigma * BAR_COUNT < 0.5
     seen = np.unique(np.floor(bar[known & (bar > 0) & (bar < BAR_COUNT)]).astype(int))
     if np.count_nonzero(known) < MIN_PIXELS or len(seen) < MIN_BARS_SEEN:
         cannot.append(f"{blind} (the scene shows {len(seen)} of {BAR_COUNT} order bars well enough)")
         return []
-    mean = np.median([fit.mean[use] for fit in fits], axis=0)
+    mean = middle([fit.mean[use] for fit in fits])
     above = (scene.frames[position][use] - mean)[known]
     here, other, other_at = _best_places(bar[known], above > 0, _nearby(fits, ladder))
     name = f"order bars {axis}"
@@ -238,7 +246,7 @@ def _bars(
             f"{other_at}: all sets are rotated or reversed alike"
         )
         return [Witness(name, False, here, other - BARS_GAIN, frames, says, whole=True)]
-    scaled, scale = _best_scale(bar[known], above > 0)
+    scaled, scale = _best_scale(bar[known], above > 0) if here + SCALE_GAIN <= 1 else (0.0, 1.0)
     if scaled >= max(MIN_SCALED_AGREEMENT, here + SCALE_GAIN):
         frames = tuple(sorted({position, *(p for fit in fits for p in fit.positions)}))
         says = (
@@ -265,13 +273,18 @@ def _nearby(fits: Sequence[Fit], ladder: Ladder) -> float:
 
 
 def _trusted(
-    scene: Scene, fits: Sequence[Fit], ladder: Ladder, cycles: NDArray[np.float64], centre: float, b: Array
+    scene: Scene,
+    fits: Sequence[Fit],
+    ladder: Ladder,
+    cycles: NDArray[np.float64],
+    lengths: NDArray[np.float64],
+    centre: float,
+    b: Array,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Field fractions (P,) from the highest rung that is surely unwrapped, and their 1-sigma."""
     variances = np.array([2 / fit.fringe_set.shifts for fit in fits])
-    vectors = np.abs(_agreement(ladder, cycles, centre))
     rung = 0
-    while rung < len(vectors) and vectors[rung] > 0.8:
+    while rung < len(lengths) and lengths[rung] > 0.8:
         rung += 1
     part = Ladder(ladder.combinations[: rung + 1], ladder.frequencies[: rung + 1], ladder.errors[:rung], False)
     fraction, _ = climb(part, cycles, centre)
@@ -282,23 +295,28 @@ def _trusted(
 def _best_places(bar: NDArray[np.float64], light: NDArray[np.bool_], nearby: float) -> tuple[float, float, str]:
     """Agreement of the bars' light with the places that the fringes give, there and elsewhere.
 
-    Returns (best agreement nearby, best elsewhere, where in words). Nearby:
-    response errors of few shifts bend positions by so much. Edges, where blur decides, count little: they are few.
+    Returns (best agreement nearby, best elsewhere, where in words); elsewhere is -1 where no place there could be
+    believed in. Nearby: response errors of few shifts bend positions by so much. Edges, where blur decides, count
+    little: they are few.
     """
     stride = max(1, bar.size // 1500)
     bar, light = bar[::stride], light[::stride]
     lit = np.append(bar_light(np.arange(BAR_COUNT), BAR_COUNT) > 0.5, False)
-    near, far, far_at = -1.0, -1.0, ""
+    moved = [(float(offset), float(min(offset, BAR_COUNT - offset))) for offset in np.arange(0, BAR_COUNT, 0.25)]
+
+    def agreement(base: NDArray[np.float64], offset: float) -> float:
+        return float(np.mean(lit[((base + offset) % BAR_COUNT).astype(np.intp)] == light))
+
+    near = max(agreement(bar, offset) for offset, away in moved if away <= nearby)
+    far, far_at = -1.0, ""
+    if near + BARS_GAIN > 1:
+        return near, far, far_at
     for mirrored in (False, True):
         base = BAR_COUNT - bar if mirrored else bar
-        for offset in np.arange(0, BAR_COUNT, 0.25):
-            moved = min(offset, BAR_COUNT - offset)
-            agrees = float(np.mean(lit[((base + offset) % BAR_COUNT).astype(np.intp)] == light))
-            if not mirrored and moved <= nearby:
-                near = max(near, agrees)
-            elif agrees > far:
+        for offset, away in moved:
+            if (mirrored or away > nearby) and (agrees := agreement(base, offset)) > far:
                 far = agrees
-                far_at = f"{'mirrored and ' if mirrored else ''}{moved / BAR_COUNT:.0%} of the field away"
+                far_at = f"{'mirrored and ' if mirrored else ''}{away / BAR_COUNT:.0%} of the field away"
     return near, far, far_at
 
 
