@@ -149,7 +149,7 @@ def sigmas_between(a: Array, b: Array) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(squares.mean(axis=1) / 2).astype(np.float64) / 0.871)
 
 
-def middle(frames: Sequence[Array] | Array) -> Array:
+def middle(frames: Sequence[Array]) -> Array:
     """(P,) median of frames, sample by sample."""
     if len(frames) == 3:  # the middle one by comparison: a tenth of the time
         a, b, c = frames

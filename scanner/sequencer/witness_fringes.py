@@ -225,7 +225,7 @@ def _means(
         means = means - black
     else:
         # Of two sets each stands half way to the other's error; of more the median is right.
-        span = middle(means) if len(fits) > 2 else means.mean(axis=0)
+        span = middle(list(means)) if len(fits) > 2 else means.mean(axis=0)
     b = middle([fit.modulation[use] for fit in fits])
     # Lamps drift and mains light beats: one gain a set is taken out; disorder differs from pixel to pixel.
     # Medians line by line: along an axis they take five times as long.
