@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from scanner.errors import DeviceBusy, ScannerError, StorageError
 from scanner.wire import (
@@ -42,6 +42,9 @@ from service.pipe import Preview
 from service.pipeline import MAX_QUEUED, Pipeline
 from service.worker_pool import WorkerPool
 
+if TYPE_CHECKING:
+    from service.rig_model import RigSettings
+
 MAX_CLIENTS = 4096
 """Connections remembered; one that was forgotten says hello again."""
 
@@ -67,7 +70,7 @@ class Control:
 
     def __init__(
         self,
-        name: str,
+        rig: RigSettings,
         endpoints: Endpoints,
         pipeline: Pipeline,
         devices: DevicesLink,
@@ -76,7 +79,8 @@ class Control:
         last_event: Callable[[], int],
         stop: Callable[[], None],
     ) -> None:
-        self._name = name
+        self._name = rig.name
+        self._phase_axis = rig.phase_axis
         self._endpoints = endpoints
         self._pipeline = pipeline
         self._devices = devices
@@ -222,6 +226,7 @@ class Control:
     async def _start(self, request: Request, client: str) -> dict[str, Any]:
         params = params_as(ScanStart, request)
         if self._pipeline.store.find(params, client) is None:
+            self._refuse_nonsense(params)
             self._refuse_while_live()
         job = await self._pipeline.submit(params, client)
         return self._with_number(job)
@@ -284,7 +289,10 @@ class Control:
         return self._with_number(job)
 
     async def _live_start(self, request: Request, client: str) -> dict[str, Any]:
-        job = await self._live.start(params_as(LiveStart, request), client)
+        params = params_as(LiveStart, request)
+        if self._pipeline.store.find(params, client) is None:
+            self._refuse_nonsense(params)
+        job = await self._live.start(params, client)
         return {**self._with_number(job), "endpoint": self._endpoints.live}
 
     async def _live_stop(self, request: Request, _client: str) -> dict[str, Any]:
@@ -294,6 +302,13 @@ class Control:
     async def _live_status(self, request: Request, _client: str) -> dict[str, Any]:
         params_as(Nothing, request)
         return {"number": self._last_event(), "run": self._live.status()}
+
+    def _refuse_nonsense(self, params: ScanStart | LiveStart) -> None:
+        from service.door import refuse_nonsense  # noqa: PLC0415  (brings NumPy; loaded while the devices open)
+
+        opened = self._devices.description
+        size = None if opened is None else (opened["projector"]["width"], opened["projector"]["height"])
+        refuse_nonsense(params, size, self._phase_axis)
 
     def _refuse_while_live(self) -> None:
         if self._live.running:

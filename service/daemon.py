@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -120,12 +121,13 @@ class Daemon:
         pipeline = Pipeline(store, spool, devices, workers, self.publish)
         live = Live(pipeline, devices, workers, self._endpoints.live)
         control = Control(
-            self._config.rig.name, self._endpoints, pipeline, devices, workers, live, lambda: self._number, self.stop
+            self._config.rig, self._endpoints, pipeline, devices, workers, live, lambda: self._number, self.stop
         )
         callers = Callers(self._control, control.answer_bytes, control.refuse_bytes)
         serving = [asyncio.create_task(callers.serve()), asyncio.create_task(self._drain_subscriptions())]
         workers.start(self._config.daemon.workers)
         opening = asyncio.create_task(_open_early(devices))
+        loading = asyncio.create_task(asyncio.to_thread(import_module, "service.door"))  # before the first scan waits
         pipeline.start(live.recover)
         feeding = asyncio.create_task(self._notifier.feed(lambda: devices.answers))
         self._notifier.ready(f"serving {self._endpoints.control}")
@@ -139,7 +141,7 @@ class Daemon:
             self._notifier.ending()
             await live.close()
             await pipeline.close()
-            ended = (*serving, opening, feeding)
+            ended = (*serving, opening, loading, feeding)
             for task in ended:
                 task.cancel()
             await asyncio.gather(*ended, return_exceptions=True)

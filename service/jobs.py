@@ -331,8 +331,10 @@ def canonical_id(job_id: str) -> str:
 
 
 def parameters_digest(params: Params) -> str:
-    """SHA-256 of the parameters without the job id, members sorted, defaults left out."""
-    content = msgspec.to_builtins(params)
+    """SHA-256 of the parameters without the job id: the same whether defaults are spelled out or not."""
+    from service.door import plain  # noqa: PLC0415  (brings NumPy, which records alone do not need)
+
+    content = plain(params)
     content.pop("job_id")
     if isinstance(params, LiveStart):
         content["kind"] = "live"  # never the same as a scan with the same words

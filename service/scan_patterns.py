@@ -27,6 +27,7 @@ from scanner.patterns import (
 from scanner.patterns.description import read_axes, read_choice, read_numbers
 from scanner.patterns.graypmp import default_gray_pmp
 from scanner.patterns.mcp_choice import choose_mcp
+from scanner.patterns.sequence import read_precorrection
 
 METHODS = ("pmp", "mcp", "gray", "cp", "gray+pmp")
 
@@ -82,6 +83,7 @@ def pattern_for(
     if method == "gray+pmp" and frequencies:
         default = default_gray_pmp(axes, projector, frequencies[0])
     _refuse_unknown(method, given, default)
+    read_precorrection(given.get("precorrection"))  # the rig's own is applied, but nonsense is no description
     described = {**default.describe(), **given}
     if method == "pmp" and frequencies and "shifts" not in given:
         described["shifts"] = [8] * len(frequencies)

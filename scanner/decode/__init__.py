@@ -126,6 +126,16 @@ WITH_STAGES = ("casey2011",)
 """Decoders that tell an observer their intermediate images."""
 
 
+def require_decoder(method: str, name: str) -> None:
+    """Raise DecodeError where a method has no decoder of this name."""
+    if name not in DECODERS.get(method, ("default",)):
+        others = ", ".join(f"{known} ({of})" for of, names in DECODERS.items() for known in names if known != "default")
+        raise DecodeError(
+            f"no decoder {name!r} for method {method!r}",
+            hint=f"leave --decoder out for the default; there are: default (any method), {others}",
+        )
+
+
 def decoder_for(
     sequence: PatternSequence, camera: CameraFormat, name: str = "default", observer: Observer | None = None
 ) -> Decoder:
@@ -140,19 +150,13 @@ def decoder_for(
     Raises:
         DecodeError: no such decoder for this method, or one that has no stages for the observer.
     """
-    # Imported on demand: a program that decodes PMP does not pay for MCP's kernels.
-    method = sequence.pattern.method
-    if name not in DECODERS.get(method, ("default",)):
-        others = ", ".join(f"{known} ({of})" for of, names in DECODERS.items() for known in names if known != "default")
-        raise DecodeError(
-            f"no decoder {name!r} for method {method!r}",
-            hint=f"leave --decoder out for the default; there are: default (any method), {others}",
-        )
+    require_decoder(sequence.pattern.method, name)
     if observer is not None and name not in WITH_STAGES:
         raise DecodeError(
             f"decoder {name!r} has no stages to show",
             hint=f"decoders that have: {', '.join(f'--decoder {known}' for known in WITH_STAGES)} (method mcp)",
         )
+    # Imported on demand: a program that decodes PMP does not pay for MCP's kernels.
     if name == "casey2011":
         from scanner.decode.mcp.casey2011 import CaseyDecoder  # noqa: PLC0415
 

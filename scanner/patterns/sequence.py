@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.errors import DecodeError
-from scanner.patterns.description import Axis, FrameRole, Pattern, ProjectorSize
+from scanner.patterns.description import Axis, FrameRole, Pattern, ProjectorSize, read_number, read_numbers
 from scanner.patterns.methods import pattern_from_description
 
 SENTINELS_BEFORE = (0.0, 1.0, 0.0)
@@ -44,6 +44,11 @@ class Precorrection:
             values = np.asarray(self.table)
             if len(values) != 256 or not np.isfinite(values).all() or values.min() < 0 or values.max() > 255:
                 raise DecodeError("a precorrection table has 256 numbers in 0 .. 255")
+            if (np.diff(values) < 0).any() or values[0] == values[-1]:
+                raise DecodeError(
+                    "a precorrection table falls, or is flat: more light would need no more input",
+                    hint="entry k is the projector's input, 0 .. 255, for linear light k / 255",
+                )
 
     def apply(self, light: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Linear light 0..1 to the projector's input values."""
@@ -137,7 +142,7 @@ class PatternSequence:
             black=_position(description.get("black"), "black"),
             sentinels=tuple(p for p in sentinels if p not in bars.values()),
             bars=dict(bars),
-            precorrection=_precorrection(description.get("precorrection")),
+            precorrection=read_precorrection(description.get("precorrection")),
         )
 
     def _special(self) -> tuple[int, ...]:
@@ -260,18 +265,21 @@ def _required_position(value: Any, key: str) -> int:
     return value
 
 
-def _precorrection(value: Any) -> Precorrection | None:
+def read_precorrection(value: Any) -> Precorrection | None:
+    """A description's "precorrection".
+
+    Raises:
+        DecodeError: it is none.
+    """
     if value is None:
         return None
     if not isinstance(value, Mapping):
         raise DecodeError(
-            f'pattern member "precorrection" must be null, {{"gamma": g}} or {{"table": [...]}}, got {value!r}'
+            f'pattern member "precorrection" must be null, {{"gamma": g}} or {{"table": [...]}}, got {value!r:.80}'
         )
-    gamma, table = value.get("gamma"), value.get("table")
-    try:
-        return Precorrection(
-            gamma=None if gamma is None else float(gamma),
-            table=None if table is None else tuple(float(v) for v in table),
-        )
-    except (TypeError, ValueError) as error:
-        raise DecodeError('pattern member "precorrection" must hold numbers') from error
+    given = {f"precorrection.{key}": member for key, member in value.items() if member is not None}
+    gamma, table = "precorrection.gamma", "precorrection.table"
+    return Precorrection(
+        gamma=read_number(given, gamma) if gamma in given else None,
+        table=read_numbers(given, table) if table in given else None,
+    )

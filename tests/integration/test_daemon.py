@@ -165,9 +165,16 @@ def test_a_client_that_vanishes_leaves_its_scan_running(endpoint: str, client: C
 def test_what_cannot_be_scanned_is_refused_in_words(
     client: Client, method: str, params: dict[str, Any], named: str
 ) -> None:
+    before = client.list_scans()
     with pytest.raises(ConfigError, match=named) as caught:
         client.scan(method, **params)
-    assert caught.value.hint or named in {"depth", "repeat"}
+    assert caught.value.hint or named == "depth"
+    assert client.list_scans() == before, "a job was taken for it"
+
+
+def test_what_only_the_plan_can_refuse_is_a_job_that_failed(client: Client) -> None:
+    with pytest.raises(ConfigError, match="exposure"):
+        client.scan("mcp", exposure=9.9e6)
     assert client.list_scans()[-1]["reason"] == "refused"
 
 
