@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -35,7 +36,7 @@ def calibration_dict(solution: Solution, created: str | None = None) -> dict[str
         **solution.extra,
         "covariance": _covariance(solution),
         "scale": _scale(solution),
-        "residuals": _residuals(solution),
+        "residuals": residuals_of(solution),
         "target": {
             "spec": solution.target.spec,
             "scale_x": float(solution.state.sheet[0]),
@@ -94,7 +95,9 @@ def _scale(solution: Solution) -> Any:
     return "unverified" if length is None else {"reference_mm": length.mm, "sigma_mm": length.sigma_mm}
 
 
-def _residuals(solution: Solution) -> dict[str, Any]:
+def residuals_of(solution: Solution) -> dict[str, Any]:
+    """How well a calibration fits, px: root mean squares of points' distances, outliers left out, over all views and
+    in each. `held_out_px` of a view: predicted by the others."""
     adjusted = solution.adjusted
     views = []
     for k, view in enumerate(solution.problem.views):
@@ -105,15 +108,24 @@ def _residuals(solution: Solution) -> dict[str, Any]:
                 "name": view.name,
                 "points": int(kept.sum()),
                 "outliers": int((~kept).sum()),
-                "camera_px": rms(adjusted.camera_residuals[k][kept]) if kept.any() else None,
-                "projector_px": rms(adjusted.projector_residuals[k][kept]) if kept.any() else None,
-                "epipolar_px": float(np.sqrt((solution.epipolar[k] ** 2).mean())),
+                **_fit(solution, [k]),
                 "held_out_px": held_out if np.isfinite(held_out) else None,
             }
         )
+    every = range(len(views))
+    return {**_fit(solution, every), "outliers": sum(view["outliers"] for view in views), "views": views}
+
+
+def _fit(solution: Solution, views: Iterable[int]) -> dict[str, float | None]:
+    """Rms of the kept points of some views; None where they have none."""
+    adjusted, chosen = solution.adjusted, list(views)
+
+    def of(residuals: Sequence[NDArray[Any]]) -> float | None:
+        kept = np.concatenate([residuals[k][adjusted.kept[k]] for k in chosen])
+        return rms(kept) if len(kept) else None
+
     return {
-        "camera_px": rms(np.concatenate(adjusted.camera_residuals)),
-        "projector_px": rms(np.concatenate(adjusted.projector_residuals)),
-        "epipolar_px": float(np.sqrt((np.concatenate(solution.epipolar) ** 2).mean())),
-        "views": views,
+        "camera_px": of(adjusted.camera_residuals),
+        "projector_px": of(adjusted.projector_residuals),
+        "epipolar_px": of([off[:, None] for off in solution.epipolar]),
     }

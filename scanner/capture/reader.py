@@ -24,6 +24,9 @@ from scanner.devices import Pixels
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat
 
+SCAN_FOLDER = "capture"
+"""Where a scan's folder has its capture"""
+
 
 class Capture:
     """A capture folder, opened to read.
@@ -41,17 +44,18 @@ class Capture:
 
     @classmethod
     def open(cls, path: Path) -> Capture:
-        """Open a folder (its capture.json) or a JSON file.
+        """Open a folder (its capture.json), the folder of a scan (the capture in there) or a JSON file.
 
         Raises:
             DecodeError: missing, unreadable or contradictory, with what and where.
         """
-        file = path / HEADER_FILE if path.is_dir() else path
+        file = _header_at(path)
         try:
             content = json.loads(file.read_text(encoding="utf-8"))
         except OSError as error:
             raise DecodeError(
-                f"cannot read {file}: {error.strerror}", hint="give a capture folder or its capture.json"
+                f"cannot read {file}: {error.strerror}",
+                hint="give a capture folder, its capture.json, or the folder of a scan",
             ) from error
         except (ValueError, RecursionError) as error:
             raise DecodeError(f"{file} is not JSON: {error}") from error
@@ -122,6 +126,14 @@ class Capture:
             and record.slot < len(slots)
             and digest_matches(slots[record.slot], record.xxh3)
         }
+
+
+def _header_at(path: Path) -> Path:
+    """The JSON file of a capture: in the folder given, in a scan's folder one further down, or the file itself."""
+    if not path.is_dir():
+        return path
+    inside = path / SCAN_FOLDER / HEADER_FILE
+    return inside if inside.is_file() and not (path / HEADER_FILE).exists() else path / HEADER_FILE
 
 
 def _read_records(path: Path) -> list[FrameRecord] | None:

@@ -92,7 +92,7 @@ def check_capture(capture: Capture) -> CaptureCheck:
     stamped = plan is not None and len(capture.all_records) > 0
     verdicts = verify(plan, header.sequence, capture.all_records) if plan and stamped else _unstamped(capture)
     count = len(header.sequence)
-    witnesses = Witnesses()
+    witnesses = Witnesses() if count > 1 else witness(header.sequence, {}, header.camera.max_value)
     if count > 1:
         for repetition in range(header.repeat):
             shown: dict[int, Pixels] = {

@@ -12,10 +12,15 @@ from service.terminal import print_error, print_facts, print_json, print_table, 
 
 if TYPE_CHECKING:
     from scanner.sequencer import CaptureCheck
+    from scanner.sequencer.findings import Witness
+
+NOTHING_HIDDEN = "nothing of what its witnesses look for: frames swapped, doubled, late or left out"
 
 
 def audit(
-    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture folder, or its JSON file.")],
+    capture: Annotated[
+        Path, typer.Argument(metavar="CAPTURE", help="A capture's or a scan's folder, or capture.json.")
+    ],
     output: Annotated[
         Path | None,
         typer.Option(
@@ -27,12 +32,14 @@ def audit(
 ) -> int:
     """Verify a capture again: stamps and content of every frame against the plan.
 
-    Exit status 1 if anything speaks against a frame; the message names it.
+    A verdict for each frame, by its time stamps; one for each witness, which looks at the pictures (black and white
+    frames, fringes, order bars); and what this sequence could not have revealed. Exit status 1 if anything speaks
+    against a frame; the message names it.
 
     \b
     Examples:
-      fringed audit scan/capture
-      fringed audit scan/capture -o timing.svg
+      fringed audit scan
+      fringed audit scan -o timing.svg
     """
     if output is not None and output.suffix not in (".svg", ".png"):
         raise typer.BadParameter(f"-o: expected a name that ends in .svg or .png, got {str(output)!r}")
@@ -42,6 +49,7 @@ def audit(
         lines.stage("reading frames")
         from scanner.capture import Capture  # noqa: PLC0415
         from scanner.sequencer import check_capture, timing_diagram  # noqa: PLC0415
+        from scanner.sequencer.findings import listed  # noqa: PLC0415
         from scanner.storage import replace_file  # noqa: PLC0415
 
         check = check_capture(Capture.open(capture))
@@ -53,7 +61,7 @@ def audit(
     else:
         _show(check, output)
     if not check.passed:
-        suspects = ", ".join(map(str, check.suspects)) or "none in particular"
+        suspects = listed(check.suspects) or "none in particular"
         print_error(f"frames and patterns are out of step; frames concerned: {suspects}")
     return 0 if check.passed else 1
 
@@ -66,9 +74,23 @@ def _show(check: CaptureCheck, diagram: Path | None) -> None:
         ("pattern", "shows", "verdict", "reasons"),
         ((v.pattern, sequence.role(v.pattern % count).value, v.verdict, "; ".join(v.reasons)) for v in check.verdicts),
     )
-    facts = [("frames", f"{len(check.capture.records)} of {check.capture.header.frame_count}")]
+    print()
+    if witnesses := check.witnesses.items:
+        print_table("witnesses", ("witness", "verdict", "says"), ((w.name, _verdict(w), w.says) for w in witnesses))
+        print()
+    facts = [("capture", str(check.capture.path))]
+    facts += [("frames", f"{len(check.capture.records)} of {check.capture.header.frame_count}")]
     facts += [(str(verdict), str(number)) for verdict, number in check.summary().items()]
-    facts += [("cannot reveal", text) for text in check.witnesses.cannot_reveal]
+    facts += [("this sequence cannot reveal", text) for text in check.witnesses.cannot_reveal or (NOTHING_HIDDEN,)]
     if diagram is not None:
         facts.append(("diagram", str(diagram)))
     print_facts("audit", facts)
+
+
+def _verdict(witness: Witness) -> str:
+    """What one witness says, in a word or two."""
+    from scanner.sequencer.findings import listed  # noqa: PLC0415
+
+    if witness.passed:
+        return "agrees"
+    return f"against frames {listed(witness.frames)}" if witness.frames else "against all"

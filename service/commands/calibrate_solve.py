@@ -189,8 +189,13 @@ def _facts(
     shift, s = state.translation, spread["translation"]
     facts.append(("translation", ", ".join(_stated(v, e, 3) for v, e in zip(shift, s, strict=True)) + " mm"))
     residuals = content["residuals"]
-    for name in ("camera", "projector", "epipolar"):
-        facts.append((f"rms {name}", f"{residuals[f'{name}_px']:.4f} px"))
+    for name, of in (
+        ("camera", "distances of points seen from points predicted"),
+        ("projector", "the same in the projector's picture"),
+        ("epipolar", "distances of projector points from the lines that their camera points lie on"),
+    ):
+        facts.append((f"rms {name}", f"{residuals[f'{name}_px']:.4f} px: {of}"))
+    facts.append(("outliers", f"{residuals['outliers']} points, in none of these figures"))
     scale = content["scale"]
     facts.append(
         ("scale", "scale unverified: no length was stated (--length)")

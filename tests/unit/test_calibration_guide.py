@@ -83,6 +83,31 @@ def test_depth_and_place_are_asked_for_in_turn() -> None:
     assert any(place == f"move it to the {name} of the picture" for name in missing)
 
 
+@pytest.mark.parametrize(
+    ("depths", "advice"),
+    [
+        ((700, 700), "bring it nearer by 10%"),
+        ((700, 798), "take it farther by 5%"),
+        ((700, 798, 700), "bring it nearer by 5%"),
+        ((700, 640), "bring it nearer by 9%"),
+        ((700, 612), "bring it nearer by 5%"),
+        ((700, 590), None),
+    ],
+)
+def test_depth_is_asked_for_by_the_shorter_way_and_only_as_far_as_it_lacks(
+    depths: tuple[int, ...], advice: str | None
+) -> None:
+    poses = [seen((0.0, 0.05), (0.0, 0.0, float(z))) for z in depths]
+    assert guide_of(*poses)._depth_wanted() == advice
+
+
+def test_a_tilt_that_was_there_is_asked_for_once_more_elsewhere() -> None:
+    tilts = ((0.4, 0.0), (-0.4, 0.0), (0.0, 0.4), (0.0, -0.4))
+    guide = guide_of(*(seen(tilt) for tilt in (*tilts, (0.0, 0.0), (0.0, 0.0))))
+    assert "once more, elsewhere" in str(guide._tilts_wanted())
+    assert "once more" not in str(guide_of(seen(tilts[0]))._tilts_wanted())
+
+
 def test_nothing_is_asked_for_that_there_is() -> None:
     """Poses that follow the advice make the guide content, and it says so only once there are enough."""
     everything = [

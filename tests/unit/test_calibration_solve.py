@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from scanner.calibration.adjustment import Equations, adjust
-from scanner.calibration.calibration_file import as_text, calibration_dict
+from scanner.calibration.calibration_file import as_text, calibration_dict, residuals_of
 from scanner.calibration.lens_slopes import lens_numbers
 from scanner.calibration.observe import LeftOut, Observation
+from scanner.calibration.panel import SIZE, ticks
+from scanner.calibration.pictures import HEAD_PX, draw
 from scanner.calibration.problem import POSES, Problem, State, View
 from scanner.calibration.solve import Solution, SolveOptions, sigmas, solve, thinned
 from scanner.calibration.targets import parse_target
@@ -175,6 +177,37 @@ def test_outlying_points_do_not_matter() -> None:
         spoilt[k] = Observation(replace(view, camera=camera), *_sizes(spoilt[k]))
     found = calibrate(TARGET, spoilt, LENGTH)
     assert found.state.translation == pytest.approx(RIG.translation, abs=0.4)
+
+
+def test_totals_are_of_the_same_points_as_the_views_figures(solution: Solution) -> None:
+    adjusted = solution.adjusted
+    off = adjusted.camera_residuals[0].copy()
+    kept = adjusted.kept[0].copy()
+    off[3], kept[3] = 50.0, False
+    changed = replace(
+        solution,
+        adjusted=replace(
+            adjusted, camera_residuals=(off, *adjusted.camera_residuals[1:]), kept=(kept, *adjusted.kept[1:])
+        ),
+    )
+    found = residuals_of(changed)
+    assert found["outliers"] == 1
+    for name in ("camera_px", "projector_px", "epipolar_px"):
+        of_views = [view[name] for view in found["views"]]
+        assert min(of_views) < found[name] < max(of_views)
+        squares = [view[name] ** 2 * view["points"] for view in found["views"]]
+        assert found[name] ** 2 == pytest.approx(sum(squares) / sum(view["points"] for view in found["views"]))
+    picture = cv2.imdecode(np.frombuffer(draw(changed), np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    assert picture.shape == (HEAD_PX + 3 * SIZE[1], 3 * SIZE[0], 3)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [(0, 1392, [0, 500, 1000]), (-0.03, 0.03, [-0.02, 0, 0.02]), (1183, 1454, [1200, 1300, 1400])],
+)
+def test_ticks_are_round_numbers_within_the_axis(low: float, high: float, expected: list[float]) -> None:
+    assert ticks(low, high) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("degrees", [90, 180, 270])

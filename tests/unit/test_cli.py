@@ -351,11 +351,26 @@ def test_audit_of_a_capture_without_stamps_proves_nothing(run: Run, capture: Pat
     assert json.loads(out)["verdicts"] == {"proved": 0, "consistent": 0, "unproved": 12}
     status, out, _ = run("audit", capture, "-o", "timing.svg")
     assert status == 0
-    assert "cannot reveal" in out
+    lines = out.splitlines()
+    assert any(line.startswith("this sequence cannot reveal  ") for line in lines)
+    witnesses = json.loads(run("audit", capture, "--json")[1])["witnesses"]
+    assert witnesses
+    assert all(any(line.startswith(w["name"]) and "  agrees  " in line for line in lines) for w in witnesses)
     assert (tmp_path / "timing.svg").read_text().startswith("<svg")
     status, _, err = run("audit", capture, "-o", "timing.svg")
     assert status == 2
     assert "--force" in err
+
+
+def test_a_scans_folder_names_the_capture_in_it(run: Run, capture: Path, tmp_path: Path) -> None:
+    (tmp_path / "scan").mkdir()
+    capture.rename(tmp_path / "scan" / "capture")
+    status, out, _ = run("audit", "scan")
+    assert status == 0
+    assert f"capture{' ' * 22}scan/capture" in out
+    status, _, err = run("audit", tmp_path)
+    assert status == 1
+    assert "the folder of a scan" in err
 
 
 def damage_image(folder: Path) -> None:
