@@ -22,31 +22,52 @@ MAX_BYTES = 4 << 30
 """Of one array: a scan of a 100-megapixel camera stays below it."""
 
 
+MEMBER_BYTES = 512
+"""Around each array at most: two headers of the archive and one of the array."""
+
+
+class NpzWriter:
+    """An uncompressed .npz, written from front to back, array after array; the same arrays give the same bytes."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        """`file` is empty, and stays open."""
+        self._file = file
+        self._members: list[zipfile.ZipInfo] = []
+
+    def add(self, name: str, array: NDArray[Any]) -> int:
+        """Write an array; returns where in the file its first byte is, C-contiguous from there on."""
+        solid = np.ascontiguousarray(array)
+        header = io.BytesIO()
+        np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(solid))
+        return self._append(f"{name}.npy", header.getvalue(), bytes_of(solid))
+
+    def close(self) -> None:
+        """Write the list of members."""
+        with zipfile.ZipFile(self._file, "w", zipfile.ZIP_STORED) as archive:
+            archive.filelist = self._members
+            archive._didModify = True  # type: ignore[attr-defined]
+
+    def _append(self, name: str, header: bytes, content: memoryview) -> int:
+        """A member whose checksum stands in its header from the start: zipfile would go back to write it later."""
+        file = self._file
+        info = zipfile.ZipInfo(name)  # dated 1980, whatever the clock says
+        info.external_attr = 0o644 << 16
+        info.header_offset = file.tell()
+        info.file_size = info.compress_size = len(header) + len(content)
+        info.CRC = zlib.crc32(content, zlib.crc32(header))
+        file.write(info.FileHeader() + header)
+        first = file.tell()
+        file.write(content)
+        self._members.append(info)
+        return first
+
+
 def write_npz(file: BinaryIO, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays as an uncompressed .npz, from front to back; the same arrays give the same bytes."""
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name, array in arrays.items():
-            solid = np.ascontiguousarray(array)
-            header = io.BytesIO()
-            np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(solid))
-            _append(archive, file, f"{name}.npy", header.getvalue(), bytes_of(solid))
-
-
-def _append(archive: zipfile.ZipFile, file: BinaryIO, name: str, header: bytes, content: memoryview) -> None:
-    """A member whose checksum stands in its header from the start: zipfile would go back and write it there later."""
-    info = zipfile.ZipInfo(name)  # dated 1980, whatever the clock says
-    info.external_attr = 0o644 << 16
-    info.header_offset = file.tell()
-    info.file_size = info.compress_size = len(header) + len(content)
-    info.CRC = zlib.crc32(content, zlib.crc32(header))
-    file.write(info.FileHeader())
-    file.write(header)
-    file.write(content)
-    archive.filelist.append(info)
-    archive.NameToInfo[name] = info
-    # Where the list of members will be written when the archive is closed.
-    archive.start_dir = file.tell()
-    archive._didModify = True  # type: ignore[attr-defined]
+    """Write arrays as an uncompressed .npz."""
+    npz = NpzWriter(file)
+    for name, array in arrays.items():
+        npz.add(name, array)
+    npz.close()
 
 
 def read_npz(path: Path, dtypes: Mapping[str, Any]) -> dict[str, NDArray[Any]]:

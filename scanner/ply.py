@@ -7,6 +7,7 @@ normal has 0 0 0, as readers of PLY take NaN badly.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import BinaryIO
 
 import numpy as np
@@ -26,6 +27,9 @@ VERTEX = np.dtype(
 )
 """One vertex in the file, 31 bytes, unpadded."""
 
+PART_LINES = 64
+"""Of the cloud, packed and written at once: some megabytes, still in the cache when they are written"""
+
 _TYPES = {"f": "float", "u": "uchar"}
 
 
@@ -35,12 +39,22 @@ def write_ply(file: BinaryIO, vertices: NDArray[np.void], comments: tuple[str, .
     Raises:
         ValueError: no vertices (an empty element is more than some readers bear), or a comment of several lines.
     """
-    if len(vertices) == 0:
-        raise ValueError("a PLY file without vertices is not written")
-    if any(not comment.isprintable() for comment in comments):
-        raise ValueError("a PLY comment is one printable line")
     file.write(_header(len(vertices), comments))
     file.write(bytes_of(np.ascontiguousarray(vertices)))
+
+
+def write_cloud(
+    file: BinaryIO, xyz: Map, normals: Map, albedo: Map, confidence: Map, comments: tuple[str, ...] = ()
+) -> None:
+    """Write the points of an organised cloud, each part of it as soon as it is packed; see `vertices_of`.
+
+    Raises:
+        ValueError: as `write_ply`.
+    """
+    vertices = _room(xyz)
+    file.write(_header(len(vertices), comments))
+    for part in _packed(vertices, xyz, normals, albedo, confidence):
+        file.write(bytes_of(part))
 
 
 def vertices_of(xyz: Map, normals: Map, albedo: Map, confidence: Map) -> NDArray[np.void]:
@@ -50,10 +64,27 @@ def vertices_of(xyz: Map, normals: Map, albedo: Map, confidence: Map) -> NDArray
         xyz, normals: (H, W, 3) float32; pixels whose xyz is NaN are left out.
         albedo, confidence: (H, W) float32.
     """
-    there = ~np.isnan(xyz[..., 2])
-    vertices = np.empty(int(np.count_nonzero(there)), VERTEX)
-    _pack(xyz, normals, _grey(albedo, there), confidence, vertices)
+    vertices = _room(xyz)
+    for _ in _packed(vertices, xyz, normals, albedo, confidence):
+        continue
     return vertices
+
+
+def _room(xyz: Map) -> NDArray[np.void]:
+    return np.empty(xyz.shape[0] * xyz.shape[1] - int(np.count_nonzero(np.isnan(xyz[..., 2]))), VERTEX)
+
+
+def _packed(
+    vertices: NDArray[np.void], xyz: Map, normals: Map, albedo: Map, confidence: Map
+) -> Iterator[NDArray[np.void]]:
+    """Fill `vertices`, `PART_LINES` lines of the cloud after another; yields what was filled."""
+    scale = _scale_of_grey(albedo, xyz)
+    done = 0
+    for begin in range(0, xyz.shape[0], PART_LINES):
+        end = min(begin + PART_LINES, xyz.shape[0])
+        count = _pack(xyz, normals, albedo, scale, confidence, begin, end, vertices[done:])
+        yield vertices[done : done + count]
+        done += count
 
 
 def warm_up() -> None:
@@ -63,6 +94,10 @@ def warm_up() -> None:
 
 
 def _header(count: int, comments: tuple[str, ...]) -> bytes:
+    if count == 0:
+        raise ValueError("a PLY file without vertices is not written")
+    if any(not comment.isprintable() for comment in comments):
+        raise ValueError("a PLY comment is one printable line")
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += [f"comment {comment}" for comment in comments]
     lines.append(f"element vertex {count}")
@@ -72,19 +107,30 @@ def _header(count: int, comments: tuple[str, ...]) -> bytes:
     return "\n".join(lines).encode("ascii", "replace")
 
 
-def _grey(albedo: Map, there: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    seen = albedo[there]
-    sample = seen[:: max(1, seen.size // 100_000)]
-    sample = sample[np.isfinite(sample)]
+def _scale_of_grey(albedo: Map, xyz: Map) -> np.float32:
+    """255 / white, 0 where nothing is bright."""
+    # A hundred thousand of the points, spread evenly.
+    every = max(1, albedo.size // 100_000)
+    sample, depth = albedo.reshape(-1)[::every], xyz.reshape(-1, 3)[::every, 2]
+    sample = sample[np.isfinite(sample) & ~np.isnan(depth)]
     white = float(np.percentile(sample, 99)) if sample.size else 0.0
-    scaled = np.nan_to_num(albedo * np.float32(255.0 / white if white > 0 else 0.0), nan=0.0, posinf=255.0)
-    return np.asarray(np.clip(scaled, 0, 255), dtype=np.uint8)
+    return np.float32(255.0 / white if white > 0 else 0.0)
 
 
 @kernel
-def _pack(xyz: Map, normals: Map, grey: NDArray[np.uint8], confidence: Map, vertices: NDArray[np.void]) -> None:
+def _pack(
+    xyz: Map,
+    normals: Map,
+    albedo: Map,
+    scale: np.float32,
+    confidence: Map,
+    begin: int,
+    end: int,
+    vertices: NDArray[np.void],
+) -> int:
+    """Lines `begin` to `end` as vertices; returns how many."""
     n = 0
-    for i in range(xyz.shape[0]):
+    for i in range(begin, end):
         for j in range(xyz.shape[1]):
             if math.isnan(xyz[i, j, 2]):
                 continue
@@ -94,6 +140,10 @@ def _pack(xyz: Map, normals: Map, grey: NDArray[np.uint8], confidence: Map, vert
             vertex.nx = normals[i, j, 0] if known else 0.0
             vertex.ny = normals[i, j, 1] if known else 0.0
             vertex.nz = normals[i, j, 2] if known else 0.0
-            vertex.red = vertex.green = vertex.blue = grey[i, j]
+            light = albedo[i, j] * scale
+            vertex.red = vertex.green = vertex.blue = (
+                np.uint8(min(light, np.float32(255))) if light > 0 else np.uint8(0)
+            )
             vertex.confidence = confidence[i, j]
             n += 1
+    return n

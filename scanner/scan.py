@@ -7,15 +7,13 @@ formats.md (scan.npz, cloud.ply, preview.png, report.json). Pictures are drawn i
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,22 +23,20 @@ from scanner.filter_settings import FilterSettings
 from scanner.filters import apply_filters
 from scanner.geometry import Calibration
 from scanner.normals import normals_of
-from scanner.npz import read_npz, write_npz
-from scanner.ply import vertices_of, write_ply
-from scanner.preview import preview_picture
+from scanner.npz import read_npz
+from scanner.scan_files import Progress, ScanWriter
 from scanner.scan_report import DECODED, NOT_LIT, read_report, report_of, share
-from scanner.storage import replace_file, replace_json, replacing, storage_errors
+from scanner.storage import Digests
 from scanner.triangulation import triangulate
 
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.uint8]
 
-Progress = Callable[[str], None]
-"""Told the name of each file as it is written whole."""
-
 _MAPS = ("rows", "columns", "sigma_rows", "sigma_columns", "sigma_z", "confidence", "albedo", "modulation")
-_DTYPES = {**dict.fromkeys(_MAPS, "<f4"), "xyz": "<f4", "reason": "u1", "stripes": "<i2", "peaks": "<f4"}
+_POINTS = ("xyz", "confidence")
+"""First in scan.npz: what clients wait for"""
+_DTYPES = {**dict.fromkeys((*_POINTS, *_MAPS), "<f4"), "reason": "u1", "stripes": "<i2", "peaks": "<f4"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,16 +106,14 @@ class Scan:
         """The same scan with more in its report."""
         return replace(self, report={**self.report, **members})
 
-    def save(
-        self, folder: Path, progress: Progress | None = None, digests: dict[str, str] | None = None
-    ) -> tuple[str, ...]:
+    def save(self, folder: Path, progress: Progress | None = None, digests: Digests | None = None) -> tuple[str, ...]:
         """Write the folder: scan.npz, cloud.ply, preview.png, (error_map.png,) report.json, each whole, in this order.
 
         report.json is last: a folder that has it is complete. Files of an earlier scan are removed first. A cloud
         without points gets no cloud.ply, and a warning in the report.
 
         Args:
-            progress: told each file when it is whole. digests: takes its SHA-256 before that, by its name.
+            progress: told each file when it is whole. digests: makes its SHA-256, by its name.
 
         Returns:
             Names of the files written, in order.
@@ -127,47 +121,8 @@ class Scan:
         Raises:
             StorageError: the folder cannot be written.
         """
-        written: list[str] = []
-        timings = dict(self.report.get("timings", {}))
-        warnings = list(self.report.get("warnings", ()))
-        with storage_errors(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-            for name in ("report.json", "error_map.png", "preview.png", "cloud.ply", "scan.npz"):
-                (folder / name).unlink(missing_ok=True)
-
-        @contextmanager
-        def file(name: str) -> Iterator[Path]:
-            with _timed(timings, f"write {name}"):
-                yield folder / name
-            written.append(name)
-            if progress is not None:
-                progress(name)
-
-        # The arrays first: who waits for points has them before anything is drawn.
-        with file("scan.npz") as path, replacing(path, digests) as npz:
-            write_npz(npz, self.arrays())
-        with ThreadPoolExecutor(1, thread_name_prefix="preview") as drawing:
-            picture = drawing.submit(lambda: _png(preview_picture(self)))
-            normals = self.normals
-            if self.xyz is not None and normals is not None and self.valid.any():
-                with file("cloud.ply") as path, replacing(path, digests) as ply:
-                    vertices = vertices_of(self.xyz, normals, self.albedo, self.confidence)
-                    write_ply(ply, vertices, ("fringed; mm, camera frame: x right, y down, z forward",))
-            elif self.xyz is not None:
-                warnings.append(f"the cloud has no points, and cloud.ply was not written{_why_empty(self.report)}")
-            else:
-                warnings.append(
-                    "without a calibration there are rows or columns, and no points: "
-                    "name one with --calibration, or in the rig file"
-                )
-            with file("preview.png") as path:
-                replace_file(path, picture.result(), digests)
-        if self.error_map is not None:
-            with file("error_map.png") as path:
-                replace_file(path, _png(self.error_map), digests)
-        with file("report.json") as path:
-            replace_json(path, {**self.report, "timings": timings, "warnings": warnings}, digests)
-        return tuple(written)
+        with ScanWriter(folder, digests) as writer:
+            return writer.write(self, progress)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The members of scan.npz, by name; those this scan has not are absent."""
@@ -254,15 +209,6 @@ def filtered_points(
     return FilteredPoints(found.xyz, found.sigma_z, reason, {"impossible": found.impossible, **removed})
 
 
-def _why_empty(report: Mapping[str, Any]) -> str:
-    removed = {name: count for name, count in (report.get("removed") or {}).items() if count}
-    if not removed:
-        return ""
-    most = max(removed, key=lambda name: removed[name])
-    what = {"depth": "lay outside --depth", "box": "lay outside --box", "impossible": "had no depth on this rig"}
-    return f": {removed[most]:,} of them {what.get(most, f'fell to the filter for {most}')}"
-
-
 def load_scan(folder: Path) -> Scan:
     """Read a scan's folder: scan.npz, and report.json if it is there.
 
@@ -289,12 +235,6 @@ def _among(kinds: tuple[Reason, ...]) -> Mask:
     table = np.zeros(256, np.bool_)
     table[list(kinds)] = True
     return table
-
-
-def _png(picture: Picture) -> bytes:
-    # Level 1 costs a tenth of the default's time and a few per cent in size on such pictures.
-    _, content = cv2.imencode(".png", picture, (cv2.IMWRITE_PNG_COMPRESSION, 1))
-    return content.tobytes()
 
 
 @contextmanager

@@ -9,11 +9,10 @@ import errno
 import hashlib
 import json
 import os
-import queue
 import shutil
-import threading
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -29,7 +28,7 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def replace_file(path: Path, content: bytes, digests: dict[str, str] | None = None) -> None:
+def replace_file(path: Path, content: bytes, digests: Digests | None = None) -> None:
     """Write `content` to `path`: a temporary file beside it, fsync, rename, fsync of the folder. digests: `replacing`.
 
     Raises:
@@ -40,66 +39,96 @@ def replace_file(path: Path, content: bytes, digests: dict[str, str] | None = No
 
 
 @contextmanager
-def replacing(path: Path, digests: dict[str, str] | None = None) -> Iterator[BinaryIO]:
+def replacing(path: Path, digests: Digests | None = None, *, room: int = 0) -> Iterator[BinaryIO]:
     """A file to write; on leaving it takes the place of `path`, as `replace_file` says. Nothing is left on failure.
 
     Args:
-        digests: takes the SHA-256 of what was written, by the file's name. It is made in another thread while this one
-            writes: from front to back, in buffers that do not change before the end.
+        path: the file; until then its bytes are in `temporary_of(path)`.
+        digests: makes the SHA-256 of what was written, once it is there: from buffers that do not change until then.
+        room: bytes that will be written at most; taken from the disk at once, which then writes them faster.
 
     Raises:
         StorageError: the disk is full, or the folder cannot be written.
     """
-    temporary = path.with_name(f".{path.name}.tmp")
+    temporary = temporary_of(path)
     with storage_errors(path):
         try:
-            with temporary.open("wb") as file, ExitStack() as reading:
-                told = file if digests is None else reading.enter_context(_Digesting(file))
-                yield cast(BinaryIO, told)
-                file.flush()
-                os.fsync(file.fileno())
-            if digests is not None:
-                digests[path.name] = cast(_Digesting, told).hexdigest()
+            with temporary.open("wb", buffering=0) as raw:
+                if room:
+                    os.posix_fallocate(raw.fileno(), 0, room)
+                file = _Written(raw, remember=digests is not None)
+                yield cast(BinaryIO, file)
+                if room:
+                    os.ftruncate(raw.fileno(), raw.tell())
+                os.fsync(raw.fileno())
             temporary.replace(path)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
         sync_folder(path.parent)
+    if digests is not None:
+        # Not before: it would take the processor from what is still being written.
+        digests.begin(path.name, file.parts)
 
 
-class _Digesting:
-    """A file that can be written, and a thread that makes the digest of what is."""
+def temporary_of(path: Path) -> Path:
+    """Where the bytes of a file are until it is whole and takes its place."""
+    return path.with_name(f".{path.name}.tmp")
 
-    def __init__(self, file: BinaryIO) -> None:
+
+class _Written:
+    """A file that is written straight from memory, and may remember from where."""
+
+    def __init__(self, file: Any, *, remember: bool) -> None:
         self._file = file
-        self._sha = hashlib.sha256()
-        self._parts: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._digest, name="digest")
-        self.tell, self.flush = file.tell, file.flush
+        self._remember = remember
+        self.parts: list[Any] = []
+        self.tell = file.tell
 
-    def __enter__(self) -> _Digesting:
-        self._thread.start()
+    def write(self, part: Any) -> int:
+        """Write bytes that do not change until their digest is made."""
+        left = memoryview(part).cast("B")
+        size = len(left)
+        if self._remember:
+            self.parts.append(part)
+        while left:
+            left = left[self._file.write(left) :]
+        return size
+
+    def flush(self) -> None:
+        """Nothing waits in here."""
+
+
+class Digests:
+    """SHA-256 of files by name, made in threads of their own. Used in a `with` statement."""
+
+    def __init__(self) -> None:
+        self._threads = ThreadPoolExecutor(2, thread_name_prefix="digest")
+        self._made: dict[str, Future[str]] = {}
+
+    def __enter__(self) -> Digests:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._parts.put(None)
-        self._thread.join()
+        self._threads.shutdown()
 
-    def write(self, part: Any) -> int:
-        """Write bytes that do not change until the file is closed."""
-        self._parts.put(part)
-        return self._file.write(part)
+    def begin(self, name: str, parts: Sequence[Any]) -> None:
+        """Make the digest of a file of these parts."""
+        self._made[name] = self._threads.submit(_sha256, parts)
 
-    def hexdigest(self) -> str:
-        """SHA-256 of all that was written, once the file is closed."""
-        return self._sha.hexdigest()
-
-    def _digest(self) -> None:
-        while (part := self._parts.get()) is not None:
-            self._sha.update(part)
+    def of(self, name: str) -> str:
+        """A file's digest, once it is made."""
+        return self._made[name].result()
 
 
-def replace_json(path: Path, content: Any, digests: dict[str, str] | None = None) -> None:
+def _sha256(parts: Sequence[Any]) -> str:
+    sha = hashlib.sha256()
+    for part in parts:
+        sha.update(part)
+    return sha.hexdigest()
+
+
+def replace_json(path: Path, content: Any, digests: Digests | None = None) -> None:
     """Write plain data as JSON with `replace_file`."""
     replace_file(path, (json.dumps(content, indent=1) + "\n").encode(), digests)
 

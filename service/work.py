@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.errors import DecodeError, ScannerError
-from scanner.storage import prepare_output
+from scanner.storage import Digests, prepare_output
 from scanner.stream import (
     Ack,
     Cancel,
@@ -218,16 +218,16 @@ class _Series:
         output = prepare_output(Path(self._start.output), force=True)
         began = time.perf_counter()
         entries: list[FileEntry] = []
-        digests: dict[str, str] = {}
 
         def written(name: str) -> None:
-            entries.append(file_entry(output, name, sha=digests.get(name)))
+            entries.append(file_entry(output, name, sha=digests.of(name)))
             if name == "scan.npz":
                 self._answer(DecodedNote(self.delivery, list(entries), _short(scan.report)))
             self._stage(f"wrote {name}")
 
         self._stage("writing files")
-        scan.save(output, written, digests)
+        with Digests() as digests:
+            scan.save(output, written, digests)
         capture = sorted(path.name for path in self._folder.iterdir() if path.is_file() and path.name[0] != ".")
         entries += [file_entry(self._folder, name, f"{CAPTURE}/{name}") for name in capture]
         _log.info("delivery %d: files written in %.2f s", self.delivery, time.perf_counter() - began)

@@ -15,12 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from scanner import scan as scan_module
+from scanner import scan_files
 from scanner.decode import Reason
 from scanner.errors import CalibrationError, StorageError
 from scanner.filter_settings import FilterSettings
-from scanner.npz import read_npz, write_npz
+from scanner.npz import NpzWriter, read_npz, write_npz
 from scanner.scan import build_scan, load_scan
+from scanner.scan_files import ScanWriter
+from scanner.storage import Digests, temporary_of
 
 
 @pytest.fixture(scope="module")
@@ -90,9 +92,9 @@ def test_columns_make_a_scan_too(rig_of, scene_with, tmp_path):
 def test_the_folder_has_what_formats_say(scan, tmp_path):
     folder = tmp_path / "new" / "scan"
     told = []
-    digests = {}
-    names = scan.save(folder, told.append, digests)
-    assert digests == {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
+    with Digests() as digests:
+        names = scan.save(folder, told.append, digests)
+        assert all(digests.of(name) == hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names)
     assert names == tuple(told) == ("scan.npz", "cloud.ply", "preview.png", "report.json")
     assert sorted(path.name for path in folder.iterdir()) == sorted(names)
     with np.load(folder / "scan.npz", allow_pickle=False) as content:
@@ -144,12 +146,37 @@ def test_a_crash_leaves_no_half_file_and_no_report(scan, tmp_path, monkeypatch):
         file.write(b"half a file")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(scan_module, "write_ply", fail)
+    monkeypatch.setattr(scan_files, "write_cloud", fail)
     with pytest.raises(StorageError, match="No space left") as error:
         scan.save(tmp_path)
     assert "disk is full" in error.value.hint
     assert [path.name for path in tmp_path.iterdir()] == ["scan.npz"]
     assert load_scan(tmp_path).report == {}
+
+
+def test_points_come_first_and_nothing_of_a_scan_that_is_given_up_stays(scan, tmp_path, monkeypatch):
+    with ScanWriter(tmp_path) as writer:
+        places = writer.points(scan.xyz, scan.confidence)
+        content = temporary_of(tmp_path / "scan.npz").read_bytes()
+        for place in places:
+            values = np.frombuffer(content, place.dtype, int(np.prod(place.shape)), place.offset)
+            np.testing.assert_array_equal(values.reshape(place.shape), getattr(scan, place.name))
+        writer.write(scan)
+    assert (tmp_path / "scan.npz").read_bytes()[: places[1].offset] == content[: places[1].offset]
+    with zipfile.ZipFile(tmp_path / "scan.npz") as archive:
+        assert archive.testzip() is None
+        assert archive.namelist()[:2] == ["xyz.npy", "confidence.npy"]
+    monkeypatch.setattr(NpzWriter, "close", raise_full)
+    with pytest.raises(StorageError, match="No space left"):
+        scan.save(tmp_path / "full")
+    with ScanWriter(tmp_path / "left") as writer:
+        writer.points(scan.xyz, scan.confidence)
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["cloud.ply"]
+    assert not any((tmp_path / "left").iterdir())
+
+
+def raise_full(*_):
+    raise OSError(28, "No space left on device")
 
 
 def test_a_folder_that_cannot_be_written_is_named(scan, tmp_path):
