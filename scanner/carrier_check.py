@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +22,10 @@ from scanner.patterns import McpPattern, ProjectorSize
 from scanner.triangulation import triangulate
 
 STRETCH_PX = 256
-"""Camera pixels of a stretch: 25 to 50 cycles, which resolve 2 to 4 per cent of frequency and a tenth of it in noise"""
+"""Camera pixels of a stretch: 13 to 50 cycles, which resolve 2 to 8 per cent of frequency and a tenth of it in noise"""
+
+SWEEPS = 4
+"""Of taking one carrier of a stretch after the other: two that are two cycles apart in it leave each other a fifth"""
 
 LEAST_PX = 96
 """Shorter stretches, at silhouettes, resolve too little."""
@@ -30,7 +34,7 @@ OFFSETS = np.arange(-0.12, 0.1201, 0.005)
 """Frequencies tried, relative to the predicted one"""
 
 NEAR = 0.02
-"""A right stretch is strongest this near the prediction: half its resolution, and what a surface may bend"""
+"""A right stretch is strongest this near the prediction: half its resolution at most, and what a surface may bend"""
 
 LEAST_CORRELATION = 0.25
 """Of a stretch's light with the best wave: less is no carrier (noise of n pixels reaches 3 / sqrt(n))"""
@@ -44,6 +48,11 @@ MOST_CONTRADICTING = 0.3
 NOTICEABLE = 0.1
 """Sound scans stay at a hundredth or two; carriers that change places leave four to five tenths."""
 
+MOST_SPREAD = 0.006
+MOST_SPREAD_STRIPES = 3.0
+"""1-sigma of single stretches about their median. Sound scans have .0003 to .0026 of frequency, .1 to .9 stripes; where
+carriers have changed places and half of the names with them, it is .011 and more, five stripes and more"""
+
 SURELY = 0.2
 """All stripes are this near to a whole number of stripes further on where the description is to blame; sound scans
 stay within .05 of none. A calibration that is off (a tenth of a per cent of focal length does as much as half a
@@ -51,6 +60,9 @@ stripe) lands anywhere."""
 
 MOST_SIGMA = 0.15
 """1-sigma of that number, in stripes, up to which it is believed: none is then five sigmas away"""
+
+MEDIAN_TO_MEAN = 1.25
+"""Sigma of a median relative to that of a mean, of Gaussian values"""
 
 UNSURE = 0.3
 """Further from none than this, it is said"""
@@ -79,6 +91,11 @@ class CarrierFit:
         return self.offset / self.per_stripe if self.per_stripe else 0.0
 
     @property
+    def spread(self) -> float:
+        """1-sigma of a single stretch, relative frequency."""
+        return float(self.sigma * self.stretches**0.5 / MEDIAN_TO_MEAN)
+
+    @property
     def sigma_stripes(self) -> float:
         """1-sigma of `stripes`."""
         return self.sigma / abs(self.per_stripe) if self.per_stripe else 0.0
@@ -89,6 +106,7 @@ class CarrierFit:
             "stretches": self.stretches,
             "contradicting": self.contradicting,
             "offset": self.offset,
+            "spread": self.spread,
             "stripes": self.stripes,
             "sigma_stripes": self.sigma_stripes,
         }
@@ -120,6 +138,12 @@ def require_carriers(
         raise DecodeError(
             f"{_said(fit)}: the pattern description or the calibration contradicts the frame",
             hint='check the description\'s "codes" and order of "carriers", and that the calibration is this rig\'s',
+        )
+    if fit.spread > max(MOST_SPREAD, MOST_SPREAD_STRIPES * abs(fit.per_stripe)):
+        raise DecodeError(
+            f"the carriers' frequencies scatter by {fit.spread:.1%} about those of the decoded stripes: many stripes "
+            "are not those that the pattern description names",
+            hint='check the description\'s "codes" and order of "carriers"',
         )
     if fit.contradicting > NOTICEABLE:
         return fit, f"{_said(fit)}: wrong stripes, or a calibration that is not this rig's any more"
@@ -163,10 +187,15 @@ def fit_carriers(
     stripe, y, x, crossing, further = stripe[use], y[use], x[use], crossing[use], further[use]
     stretch = stripe * (1 + lines.shape[1] // STRETCH_PX) + x // STRETCH_PX
     _, stretch, length = np.unique(stretch, return_inverse=True, return_counts=True)
-    alternating = _alternating(light[y, x], stretch, length)
     cycles = crossing / projector.along("x" if along_rows else "y")
+    # Shading and print along a stripe are slower than its carriers, and would outweigh them.
+    period_px = 1 / max(min(pattern.carriers) * _cycles_per_px(cycles, x, stretch), 1 / STRETCH_PX)
+    even = light - cv2.blur(light, (2 * round(period_px / 2) + 1, 1))
+    alternating = _alternating(even[y, x], stretch, length)
+    has = [_has_carrier(pattern, stripe, bit) for bit in range(pattern.bits)]
+    alone = _one_by_one(alternating, [cycles * carrier for carrier in pattern.carriers], has, stretch, length)
     found = [
-        _best_offsets(alternating, cycles * carrier, stretch, length, _has_carrier(pattern, stripe, bit))
+        _best_offsets(alone[bit], cycles * carrier, stretch, length, has[bit])
         for bit, carrier in enumerate(pattern.carriers)
     ]
     offsets = np.concatenate([offsets for offsets, _ in found])
@@ -177,8 +206,8 @@ def fit_carriers(
         return CarrierFit(expected, int(offsets.size), 1.0, 0.0, 0.0)
     per_stripe = -_relative_slope(further, crossing, stretch, length)
     middle = float(np.median(offsets))
-    # A median's sigma is 1.25 that of a mean, and a Gaussian's sigma 1.48 times its median deviation.
-    sigma = 1.25 * 1.48 * float(np.median(np.abs(offsets - middle))) / np.sqrt(offsets.size)
+    # A Gaussian's sigma is 1.48 times its median deviation.
+    sigma = MEDIAN_TO_MEAN * 1.48 * float(np.median(np.abs(offsets - middle))) / np.sqrt(offsets.size)
     contradicting = float(np.mean(np.abs(offsets) > NEAR))
     return CarrierFit(expected, int(offsets.size), contradicting, middle, per_stripe, float(sigma))
 
@@ -223,6 +252,12 @@ def _along_stripe(
     return found
 
 
+def _cycles_per_px(cycles: Array, x: NDArray[np.intp], stretch: NDArray[np.intp]) -> float:
+    """Median step of `cycles` from one camera px to the next of a stretch; 0 if there is none."""
+    follow = (np.diff(x) == 1) & (np.diff(stretch) == 0)
+    return float(np.median(np.abs(np.diff(cycles)[follow]))) if follow.any() else 0.0
+
+
 def _alternating(light: NDArray[np.float32], stretch: NDArray[np.intp], length: NDArray[np.intp]) -> Array:
     """Light without its mean over the stretch, of unit power; 0 in stretches without any."""
     centred: Array = light - (np.bincount(stretch, light) / length)[stretch]
@@ -233,6 +268,31 @@ def _alternating(light: NDArray[np.float32], stretch: NDArray[np.intp], length: 
 def _has_carrier(pattern: McpPattern, stripe: NDArray[np.intp], bit: int) -> NDArray[np.bool_]:
     has = np.array([bool((pattern.code_of(s) or 0) >> bit & 1) for s in range(pattern.stripe_count)])
     return has[stripe]
+
+
+def _one_by_one(
+    alternating: Array,
+    cycles: list[Array],
+    has: list[NDArray[np.bool_]],
+    stretch: NDArray[np.intp],
+    length: NDArray[np.intp],
+) -> list[Array]:
+    """For each carrier the light without the others that a stretch has by its name, each as it fits best.
+
+    Of two carriers a tenth apart, as the published ones are, blur leaves the lower one stronger: in a short stretch
+    both would be found where it is.
+    """
+    waves = [np.zeros_like(alternating) for _ in cycles]
+    rest = alternating.copy()
+    for _ in range(SWEEPS):
+        for bit, phase in enumerate(cycles):
+            turning = np.exp(2j * np.pi * phase)
+            whole = rest + waves[bit]
+            product = whole * turning.conj()
+            real, imag = (np.bincount(stretch, part) * 2 / length for part in (product.real, product.imag))
+            waves[bit] = np.where(has[bit], real[stretch] * turning.real - imag[stretch] * turning.imag, 0.0)
+            rest = whole - waves[bit]
+    return [rest + wave for wave in waves]
 
 
 def _best_offsets(

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from drivers.simulated.rigs import rig
-from scanner.carrier_check import fit_carriers, require_carriers
+from scanner import carrier_check
+from scanner.carrier_check import CarrierFit, fit_carriers, require_carriers
 from scanner.decode import decoder_for
 from scanner.errors import DecodeError
 from scanner.patterns import McpPattern, PatternSequence
@@ -87,3 +88,35 @@ def test_too_little_says_nothing():
     few = np.full_like(rows, np.nan)
     few[100:140, 100:140] = rows[100:140, 100:140]
     assert fit_carriers(CALIBRATION, PATTERN, QUICK, frame, few) is None
+
+
+def test_of_two_carriers_a_tenth_apart_each_is_found_where_it_is():
+    """As in the published pattern, over a stretch in which they are two cycles apart; the lower one is stronger."""
+    n = 256
+    cycles = [f * np.arange(n) / 1392 for f in (120.0, 132.0)]
+    light = 1.0 * np.cos(2 * np.pi * cycles[0] + 0.3) + 0.6 * np.cos(2 * np.pi * cycles[1] + 1.9)
+    stretch, length, has = np.zeros(n, np.intp), np.array([n]), np.ones(n, bool)
+    alone = carrier_check._one_by_one(light, cycles, [has, has], stretch, length)
+    for part, phase in zip(alone, cycles, strict=True):
+        offsets, _ = carrier_check._best_offsets(part, phase, stretch, length, has)
+        assert abs(offsets[0]) < 0.005
+
+
+def test_shading_along_stripes_hides_no_carrier():
+    frame, rows = decoded("board", PATTERN)
+    steep = (frame * np.linspace(0.15, 1, frame.shape[1])).astype(np.uint8)
+    fit = fit_carriers(CALIBRATION, PATTERN, QUICK, steep, rows)
+    assert fit is not None
+    assert fit.stretches >= 0.9 * fit.expected
+    assert fit.contradicting < 0.1
+
+
+@pytest.mark.parametrize(("sigma", "refused"), [(0.0016, True), (0.00017, False)])
+def test_names_that_scatter_by_stripes_are_refused(sigma, refused, monkeypatch):
+    """As measured with the published pattern: two carriers exchanged in the description, and the right one."""
+    monkeypatch.setattr(carrier_check, "fit_carriers", lambda *_: CarrierFit(168, 168, 0.065, 0.0, 0.00195, sigma))
+    if not refused:
+        assert require_carriers(CALIBRATION, PATTERN, QUICK, np.empty(0), np.empty(0))[1] is None
+        return
+    with pytest.raises(DecodeError, match="scatter"):
+        require_carriers(CALIBRATION, PATTERN, QUICK, np.empty(0), np.empty(0))
