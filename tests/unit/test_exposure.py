@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from drivers.registry import open_camera, open_projector
 from scanner.clock import VirtualClock
 from scanner.devices import TriggerMode
 from scanner.errors import DeviceError
-from scanner.sequencer import ExposureChoice, auto_exposure
+from scanner.sequencer import ExposureChoice, auto_exposure, exposure
 from scanner.sequencer.exposure import CEILING, LONGEST_NS
 
 
@@ -79,3 +81,13 @@ def test_no_light_at_all_is_said() -> None:
     choice = chosen("&exposure_scale=0.0001&noise=false")
     assert choice.warning is not None
     assert "lens cap" in choice.warning
+
+
+@pytest.mark.parametrize(("bright", "level"), [(2, 60), (4, 60), (6, 200), (50, 200)])
+def test_what_a_two_hundredth_of_the_picture_reaches_is_metered(bright: int, level: int) -> None:
+    """A few glints may clip; half a per cent of the view may not."""
+    pixels = np.full(1000, 60, np.uint8)
+    pixels[:bright] = 200
+    shots = SimpleNamespace(expose_for=lambda exposure_ns: None, steady=lambda image: SimpleNamespace(pixels=pixels))
+    seen, _ = exposure._white(shots, 1, SimpleNamespace(max_value=255))  # type: ignore[arg-type]
+    assert seen == pytest.approx(level / 255)

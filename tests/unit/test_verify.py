@@ -127,6 +127,28 @@ def test_exposures_that_differ_are_named() -> None:
     assert "the others for" in verdicts[7].reasons[-1]
 
 
+def test_exposures_differ_beyond_a_step_and_what_their_stamps_are_unsure_of() -> None:
+    constant = replace(PLAN, modulation_ns=None)
+    most = PLAN.step_ns + 2 * (1000 + 1000)
+    for by, named in ((most, []), (most + 1, [7])):
+        records = sound()
+        records[7] = moved(records[7], 0, end_ns=records[7].exposure.end_ns + by)  # type: ignore[union-attr]
+        assert [v.pattern for v in verify(constant, PMP, records) if v.suspect] == named
+
+
+def test_what_a_flip_is_unsure_of_is_taken_off_both_ends_of_a_patterns_time() -> None:
+    first_proved = -5_000_000 + 4_700_000 + 1001
+    last_proved = SLOT_NS + 4_000_000 - 1000 - 5_000_000 - PLAN.exposure_ns
+    for by, unsure in ((first_proved, 4), (last_proved, 5)):
+        records = sound()
+        records[4] = moved(records[4], by)
+        assert verify(PLAN, PMP, records)[4].verdict == "proved"
+        flip = records[unsure].flip
+        assert flip is not None
+        records[unsure] = replace(records[unsure], flip=replace(flip, bound_ns=500))
+        assert verify(PLAN, PMP, records)[4].suspect
+
+
 def test_doubled_ids_backward_stamps_missing_and_incomplete_frames() -> None:
     records = sound()
     records[5] = replace(records[5], frame_id=4)
