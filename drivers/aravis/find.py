@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import threading
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,12 @@ from typing import Any
 from drivers.aravis.library import USB_HINT, aravis, is_library_error, translated
 from drivers.aravis.watch import GvcpProbe, Restarted
 from scanner.errors import ConfigError, DeviceBusy, DeviceNotFound
+
+USB = "USB3Vision"
+"""A protocol, in Aravis's words"""
+
+_looking = threading.Lock()
+"""The library's lists are made anew by whoever looks: one at a time"""
 
 LOOKS, LOOK_S = 3, 0.2
 """How often, and for how long each time, a camera is asked for a sign of life before it is opened"""
@@ -43,7 +50,12 @@ def find_cameras() -> list[Found]:
         ConfigError: the library is not installed.
     """
     library = aravis()
-    library.update_device_list()
+    with _looking:
+        library.update_device_list()
+        return _listed(library)
+
+
+def _listed(library: Any) -> list[Found]:
     found = []
     for i in range(library.get_n_devices()):
         one = Found(
@@ -60,8 +72,8 @@ def find_cameras() -> list[Found]:
     return sorted(found, key=lambda one: one.identity)
 
 
-def open_camera(device: str) -> Any:
-    """The Aravis.Camera that a rig file's string means, controlled by us.
+def open_camera(device: str) -> tuple[Any, str]:
+    """The Aravis.Camera that a rig file's string means, controlled by us; and its identity, empty for an address.
 
     Args:
         device: an IPv4 address, vendor-model-serial, serial number, MAC address or GUID, user-defined name; "" is the
@@ -73,13 +85,16 @@ def open_camera(device: str) -> Any:
         ConfigError: several cameras answer to it.
     """
     library = aravis()
-    name = device if is_address(device) else _identity(device)
+    name, protocol = ("", "") if is_address(device) else _identity(device)
     try:
         if is_address(device):
             _look_for(device)
             # Straight to the network: a look at every USB device first would take time and leave a monitor running.
             opened = library.GvInterface.get_instance().open_device(device)
             camera = library.Camera.new_with_device(opened)
+        elif protocol == USB:
+            # Nor the other way round: the library asks the network first, and waits a second for answers.
+            camera = library.Camera.new_with_device(library.UvInterface.get_instance().open_device(name))
         else:
             camera = library.Camera.new(name)
     except Exception as error:
@@ -88,7 +103,7 @@ def open_camera(device: str) -> Any:
         raise
     if camera.is_gv_device() and not camera.get_device().is_controller():
         raise DeviceBusy("another program controls the camera", device=device or name, hint="close that program")
-    return camera
+    return camera, name
 
 
 def _look_for(address: str) -> None:
@@ -111,13 +126,18 @@ def is_address(device: str) -> bool:
     return True
 
 
-def _identity(device: str) -> str:
-    """Aravis's name of the camera; names it does not list (user-defined ones, host names) as they are."""
+def _identity(device: str) -> tuple[str, str]:
+    """Aravis's name of the camera, and its protocol; names it does not list (user-defined, host names) as they are.
+
+    One that is called by its whole identity, as after a loss, is looked for on USB first: that takes no time.
+    """
+    if device in _identities_on_usb():
+        return device, USB
     found = find_cameras()
     if not device:
         if not found:
             raise DeviceNotFound("no camera answers", device="aravis", hint=NONE_FOUND)
-        return found[0].identity
+        return found[0].identity, found[0].protocol
     named = [one for one in found if device in (one.identity, one.serial, one.address, one.physical)]
     if len(named) > 1:
         raise ConfigError(
@@ -125,7 +145,16 @@ def _identity(device: str) -> str:
             device="aravis",
             hint="name one of: " + ", ".join(one.identity for one in named),
         )
-    return named[0].identity if named else device
+    return (named[0].identity, named[0].protocol) if named else (device, "")
+
+
+def _identities_on_usb() -> set[str]:
+    if not hasattr(aravis(), "UvInterface"):  # built without USB
+        return set()
+    with _looking:
+        bus = aravis().UvInterface.get_instance()
+        bus.update_device_list()
+        return {bus.get_device_id(i) or "" for i in range(bus.get_n_devices())}
 
 
 def _not_opened(error: Exception, device: str) -> Exception:

@@ -139,14 +139,14 @@ class Link:
     def _open(self, device: str) -> None:
         with _opening:
             before = udp_inodes()
-            camera = open_camera(device)
+            camera, identity = open_camera(device)
             if camera.is_gv_device():
                 interface = camera.get_device().get_interface_address().get_address().to_string()
                 self._control = ControlSocket(before, interface)
         self.features = Features(camera.get_device(), self.name)
         self._camera = camera
         self.is_gige = bool(camera.is_gv_device())
-        self.address = ""
+        self.address = identity
         if self.is_gige:
             self.address = camera.get_device().get_device_address().get_address().to_string()
         self.features.execute_if_there("AcquisitionStop")

@@ -109,6 +109,7 @@ class KmsProjector:
     def load(self, images: Sequence[Image]) -> None:
         """Replace the images; what is on show stays until the next `show`. See `scanner.devices.Projector.load`."""
         self._check_open()
+        self._check_connected()
         shape = (self._mode.height, self._mode.width)
         check_images(images, shape, self._name)
         spare = [buffer for buffer in self._images if buffer is not self._shown]
