@@ -6,6 +6,7 @@ One path for every caller: the decode worker feeds frames as they arrive, `fring
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -246,6 +247,7 @@ class Reconstruction:
             "created": header.created,
             "method": header.sequence.pattern.method,
             "frames": len(capture.records),
+            "shows": Counter(str(header.sequence.role(n)) for n in range(len(header.sequence))),
             "missing": list(capture.missing),
             "state": header.state,
             "reason": header.reason,

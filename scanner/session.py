@@ -122,7 +122,8 @@ def unreachable(endpoint: str, what: str) -> Unreachable:
     """The error for a daemon that does not answer, with how to start one."""
     return Unreachable(
         f"no daemon at {endpoint}: {what}",
-        hint="start one with: fringed daemon CONFIG.toml (or leave --connect out for a private one)",
+        hint=f"start one that listens there: fringed daemon CONFIG.toml --endpoint {endpoint}; or name another's with "
+        "--connect",
     )
 
 

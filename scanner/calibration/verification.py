@@ -28,6 +28,13 @@ DRAWS = 400
 belong to it, and once in fifty if a fifth does."""
 GROSS_SPREADS = 8.0
 """Distance from the feature, in units of the median one, from which a point belongs to something else."""
+OTHER_SIZES = 1.2 ** np.arange(-5.0, 6.0)
+"""Where there is no sphere of the diameter given, one of so many times that is looked for, each to a tenth: a radius
+taken for a diameter, and scales that are wrong by as much"""
+OTHER_SAMPLE = 4000
+"""Points of a scan that are asked for it"""
+ROUND_SHARE = 0.02
+"""Of its diameter, rms: what fits a sphere worse is something else that is round, as a head (4 to 7 %)"""
 SAMPLE = 20_000
 
 
@@ -133,16 +140,19 @@ def sphere(xyz: NDArray[Any], diameter_mm: float | None = None) -> Probing:
     reach = 0.7 * diameter_mm if diameter_mm is not None else 0.3 * float(np.ptp(points, axis=0).max())
     used = _belonging(points, _sphere_distance(diameter_mm), 4, reach)
     if used.sum() < FEWEST_POINTS:
-        raise DecodeError(f"no sphere among the points: {int(used.sum())} lie on the best one")
+        raise _no_sphere(points, int(used.sum()), diameter_mm)
     on = points[used]
     centre, radius = _sphere(on)
     off = np.linalg.norm(on - centre, axis=1) - radius
+    rms = float(np.sqrt((off**2).mean()))
+    if rms > ROUND_SHARE * 2 * radius:
+        raise _no_sphere(points, 0, diameter_mm)
     x, y, z = (float(c) for c in centre)
     return Probing(
         form_mm=_spread(off),
         size_mm=None if diameter_mm is None else 2 * radius - diameter_mm,
         diameter_mm=2 * radius,
-        rms_mm=float(np.sqrt((off**2).mean())),
+        rms_mm=rms,
         centre_mm=(x, y, z),
         points=len(on),
         used=float(used.mean()),
@@ -310,6 +320,33 @@ def _sphere(points: Array) -> tuple[Array, float]:
         if np.abs(step).max() < 1e-9:
             break
     return middle + centre, radius
+
+
+def _no_sphere(points: Array, on_best: int, diameter_mm: float | None) -> DecodeError:
+    """The error for a sphere that is not there, with the one of another size that is."""
+    if diameter_mm is None:
+        return DecodeError(f"no sphere among the points: {on_best} lie on the best one")
+    few = points[:: -(-len(points) // OTHER_SAMPLE)]
+    for other in sorted(diameter_mm * OTHER_SIZES, key=lambda size: abs(float(np.log(size / diameter_mm)))):
+        used = _belonging(few, _sphere_distance(other), 4, 0.7 * other)
+        if used.sum() < FEWEST_POINTS // 5:
+            continue
+        centre, radius = _sphere(few[used])
+        rms = float(np.sqrt(np.mean((np.linalg.norm(few[used] - centre, axis=1) - radius) ** 2)))
+        if rms < ROUND_SHARE * 2 * radius:
+            doubled = abs(radius / diameter_mm - 1) < 0.1
+            return DecodeError(
+                f"no sphere of {diameter_mm:g} mm diameter among the points; there is one of {2 * radius:.2f} mm "
+                f"({used.mean():.0%} of the points, {rms:.3f} mm rms)",
+                hint="give its diameter, not its radius"
+                if doubled
+                else "is that its diameter, in mm? Else the scale of the calibration is wrong",
+            )
+    return DecodeError(
+        f"no sphere of {diameter_mm:g} mm diameter among the points, and none of {OTHER_SIZES[0]:.1f} to "
+        f"{OTHER_SIZES[-1]:.1f} times that",
+        hint="keep its surroundings out of the scan: fringed decode --box or --depth",
+    )
 
 
 def _sphere_distance(diameter_mm: float | None) -> Any:

@@ -10,6 +10,8 @@ from service.commands.options import AsJson
 from service.terminal import print_json, print_table
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from scanner.devices import DeviceInfo
 
 
@@ -29,13 +31,25 @@ def devices(as_json: AsJson = False) -> int:
         return 0
     rows = ((device.kind, device.driver, device.device, device.model) for device in found)
     print_table("devices", ("kind", "driver", "device", "model"), rows)
-    real = [device for device in found if device.driver != "simulated"]
-    for device in real:
-        print(f"\n# {device.model}\n{_piece(device)}")
-    if not real:
+    simulated = [device for device in found if device.driver == "simulated"]
+    for device in found:
+        if device not in simulated:
+            print(f"\n# {device.model}\n{_piece(device)}")
+    if len(simulated) == len(found):
         print("\nno device is plugged in that a driver can see (fringed doctor looks why); without one:")
         print("fringed scan --rig simulated")
+    if simulated:
+        print(f"\n{_simulated_rig(simulated)}")
     return 0
+
+
+def _simulated_rig(devices: Sequence[DeviceInfo]) -> str:
+    """A whole rig file: simulated devices see each other where they name one scene."""
+    names = list(dict.fromkeys(device.device for device in devices))
+    of_first = (device for device in devices if device.device == names[0] and device.kind != "trigger")
+    others = f"; also {', '.join(names[1:])}" if names[1:] else ""
+    head = f"# a simulated rig: all its devices name one scene{others}\n# (more scenes: fringed devices --json)"
+    return "\n\n".join((head, *map(_piece, of_first)))
 
 
 def _piece(device: DeviceInfo) -> str:

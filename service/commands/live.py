@@ -51,7 +51,12 @@ def live(
     ] = None,
     connect: Connect = None,
     xyz: Annotated[bool, typer.Option("--xyz", help="Send points in mm instead of projector rows.")] = False,
-    stride: Annotated[int, typer.Option(metavar="N", min=1, max=64, help="With --xyz: every Nth pixel both ways.")] = 1,
+    stride: Annotated[
+        int,
+        typer.Option(
+            metavar="N", min=1, max=64, help="With --xyz: every Nth pixel both ways (2: a quarter of the points)."
+        ),
+    ] = 1,
     seconds: Annotated[
         float | None, typer.Option(metavar="S", min=0.1, max=31_536_000, help="End after this long.")
     ] = None,
@@ -142,7 +147,7 @@ def _live(
             if record is not None:
                 _fetch(client, job_id, record)
         outcome = client.result(job_id)
-    return {**outcome, "results_read": watching.read}
+    return {**outcome, "results_read": watching.read, "points_sent": watching.sent}
 
 
 def stop(client: Client, job_id: str) -> None:
@@ -160,6 +165,8 @@ class _Watching:
 
     def __init__(self, client: Client, picture: Path | None, begun: Any) -> None:
         self.read = 0
+        self.sent: int | None = None
+        """see `sent_points`, of the newest result that was looked at"""
         self._client = client
         self._picture = picture
         self._begun = begun
@@ -176,13 +183,23 @@ class _Watching:
             run = self._client.live_status()
             if run is None:
                 return
-            line(figures(run["live"]))
+            self.sent = sent_points(frame)
+            line(figures(run["live"], self.sent))
             if self._picture is not None:
                 _draw(self._picture, frame, f"{run['live']['results_per_s']:.0f} a second")
 
 
-def figures(live: Mapping[str, Any]) -> str:
-    """The line: rates, drops, latency, points."""
+def sent_points(frame: LiveFrame) -> int | None:
+    """Points that a thinned result holds; None where all are sent."""
+    import numpy as np  # noqa: PLC0415
+
+    if frame.xyz is None or frame.header.stride == 1:
+        return None
+    return int(np.count_nonzero(np.isfinite(frame.xyz[..., 2])))
+
+
+def figures(live: Mapping[str, Any], sent: int | None = None) -> str:
+    """The line: rates, drops, latency, points; `sent`: of those, where they are thinned."""
     latency = live["latency_ms"]
     parts = [
         f"{live['frames_per_s']:.1f} frames/s in",
@@ -190,7 +207,7 @@ def figures(live: Mapping[str, Any]) -> str:
         f"{live['dropped']:,} dropped",
         f"{live['lost']:,} lost" if live["lost"] else "",
         f"latency {_ms(latency['p50'])}, p99 {_ms(latency['p99'])}",
-        f"{live['points']:,} points",
+        f"{live['points']:,} points" if sent is None else f"{sent:,} points sent of {live['points']:,}",
         "recording" if live["retain"] != "none" else "",
         f"({live['problem']})" if live["problem"] else "",
     ]
@@ -234,7 +251,8 @@ def _report(outcome: Mapping[str, Any], record: Path | None, *, as_json: bool) -
     report.pop("calibration", None)
     if as_json:
         place = None if record is None else str(record)
-        print_json({"state": outcome["state"], "folder": place, "results_read": outcome["results_read"], **report})
+        own = {key: outcome[key] for key in ("results_read", "points_sent")}
+        print_json({"state": outcome["state"], "folder": place, **own, **report})
         return
     latency = report["latency_ms"]
     facts = [

@@ -19,12 +19,12 @@ def status(
     ] = DEFAULT_ENDPOINT,
     as_json: AsJson = False,
 ) -> int:
-    """Ask a running daemon how it is.
+    """Ask a running daemon how it is: devices, workers, scans and disk. Scans without --connect have none that runs.
 
     \b
     Examples:
-      fringed status
-      fringed status --connect ipc:///tmp/try.ipc --json
+      fringed status                                       of the service on this machine
+      fringed status --connect ipc:///tmp/try.ipc --json   of one started with --endpoint
     """
     from scanner.client import Client  # noqa: PLC0415
 

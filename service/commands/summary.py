@@ -22,6 +22,15 @@ _FILES = (
 )
 
 
+_FOR = {
+    "white": "{} white",
+    "black": "{} black",
+    "sentinel": "{} black and white around them that prove the timing",
+    "bars": "{} of bars that prove the order",
+}
+"""What frames are for that are not the pattern's own, by their role"""
+
+
 def report_result(folder: Path, seconds: float, stages: Mapping[str, float], *, as_json: bool) -> None:
     """Print the table, or the JSON document, of a scan's folder. stages: seconds by stage, as the user waited."""
     report: dict[str, Any] = json.loads((folder / "report.json").read_text(encoding="utf-8"))
@@ -42,7 +51,7 @@ def report_result(folder: Path, seconds: float, stages: Mapping[str, float], *, 
 
 
 def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
-    facts = []
+    facts = _frames(report.get("capture") or {})
     coverage = report.get("coverage") or {}
     if (lit := coverage.get("lit")) is not None:
         kept = coverage.get("points_of_lit") if report.get("depth_mm") or report.get("removed") else None
@@ -69,6 +78,18 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         more = f"; {everywhere:,} with those at edges" if everywhere not in (None, wrong) else ""
         facts.append(("wrong", f"{wrong:,} points on a wrong fringe or stripe{more}"))
     return facts
+
+
+def _frames(capture: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """How many frames, and what those are for that the pattern itself does not account for."""
+    shows: Mapping[str, int] = capture.get("shows") or {}
+    others = [words.format(shows[role]) for role, words in _FOR.items() if shows.get(role)]
+    if not others:
+        return []
+    repeated = f", {capture['repeat']} times" if capture.get("repeat", 1) > 1 else ""
+    missing = f"; {len(capture['missing'])} missing" if capture.get("missing") else ""
+    fringes = shows.get("fringe", 0)
+    return [("frames", f"{fringes} of the pattern, {', '.join(others)}{repeated}{missing}")]
 
 
 def _uncertainty(budget: Mapping[str, Any]) -> tuple[str, str] | None:

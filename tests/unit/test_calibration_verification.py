@@ -96,6 +96,13 @@ def test_sphere_of_another_size_is_not_found() -> None:
         sphere(board(), 20.0)
 
 
+@pytest.mark.parametrize(("given", "hint"), [(25.0, "not its radius"), (40.0, "scale of the calibration")])
+def test_a_sphere_of_another_size_is_named_with_its_own(given: float, hint: str) -> None:
+    with pytest.raises(DecodeError, match=rf"no sphere of {given:g} mm.* there is one of 50\.0") as refused:
+        sphere(ball(noise_mm=0.03), given)
+    assert hint in refused.value.hint
+
+
 def test_repeatability_is_the_noise_and_the_drift() -> None:
     scans = [board(0.04, seed=k) for k in range(8)]
     steep = np.cos(np.radians(20))

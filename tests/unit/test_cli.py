@@ -210,6 +210,25 @@ def test_devices_prints_the_piece_of_a_rig_file(run: Run, monkeypatch: pytest.Mo
     assert "fringed doctor" in run("devices")[1]
 
 
+def test_devices_prints_a_rig_file_of_simulated_ones(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    of_rigs = [("camera", "casey2011/bust"), ("camera", "quick/bust"), ("projector", "casey2011/bust")]
+    seen = [DeviceInfo("simulated", device, kind, "", {}) for kind, device in (*of_rigs, ("trigger", "casey2011/bust"))]
+    monkeypatch.setattr("drivers.registry.discover", lambda: seen)
+    _, out, _ = run("devices")
+    (tmp_path / "rig.toml").write_text(out[out.index("# a simulated rig") :])
+    assert "also quick/bust" in out
+    status, out, _ = run("check-config", "rig.toml")
+    assert status == 0
+    assert "simulated casey2011/bust" in out
+
+
+def test_status_of_no_daemon_says_how_to_start_one_there(run: Run, tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/none.ipc"
+    status, _, err = run("status", "--connect", endpoint)
+    assert status == 1
+    assert f"fringed daemon CONFIG.toml --endpoint {endpoint}" in err
+
+
 def test_a_driver_that_cannot_look_costs_only_its_own_devices(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -19,7 +19,7 @@ from scanner.clock import VirtualClock
 from scanner.devices import Exposure, Source, TriggerMode
 from scanner.durations import BIN_MS, Durations
 from scanner.errors import DecodeError, DeviceLost, ProtocolError, ScannerError, StorageError
-from scanner.live import LiveWatch
+from scanner.live import LiveFrame, LiveWatch
 from scanner.live_picture import encoded, live_picture, relief
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
 from scanner.reconstruct_live import quantised, row_scale
@@ -27,6 +27,7 @@ from scanner.sequencer import Rig, endless
 from scanner.series import read_series, recording_at, segment_name
 from scanner.stream import LiveBegin, LiveCounts, LiveFrame
 from scanner.wire_images import LiveHeader, encode_image
+from service.commands.live import figures, sent_points
 from service.live_files import close_recording, recorded_files, reserve
 from service.live_series import LiveSeries, LiveTotals
 from service.live_storage import FrameRing, Recording, ring_slots
@@ -371,3 +372,17 @@ def test_frames_without_a_pattern_are_results_with_words(work: tuple[LiveWork, l
     working.close()
     assert sum(counted.undecodable for counted in said) == 1
     assert any(counted.problem for counted in said)
+
+
+# --- the terminal -------------------------------------------------------------------------------------------------
+
+
+def test_the_line_counts_the_points_that_are_sent() -> None:
+    xyz = np.full((4, 6, 3), np.nan, np.float32)
+    xyz[:3] = 500.0
+    thinned = LiveFrame(head(1, content="xyz", width=6, height=4, dtype="float32", stride=2, points=70), xyz, 0)
+    whole = LiveFrame(head(1, content="xyz", width=6, height=4, dtype="float32", stride=1, points=18), xyz, 0)
+    run = dict.fromkeys(("frames_per_s", "results_per_s", "dropped", "lost"), 1)
+    run |= {"points": 70, "retain": "none", "problem": None, "latency_ms": {"p50": 1.0, "p99": 2.0}}
+    assert "  18 points sent of 70" in figures(run, sent_points(thinned))
+    assert "  70 points" in figures(run, sent_points(whole))

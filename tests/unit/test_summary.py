@@ -30,6 +30,7 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
     depth = {"rms": 0.07, "p99": 0.2}
     report = {
         "points": 9,
+        "capture": {"frames": 18, "shows": {"sentinel": 6, "white": 1, "black": 1, "fringe": 1}, "repeat": 2},
         "coverage": {"lit": 0.99, "points_of_lit": 0.2},
         "depth_mm": {"p1": 1.0, "p99": 2.0},
         "uncertainty": {
@@ -44,6 +45,7 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
     (tmp_path / "report.json").write_text(json.dumps(report), encoding="utf-8")
     report_result(tmp_path, 1.0, {}, as_json=False)
     printed = capsys.readouterr().out
+    assert "1 of the pattern, 1 white, 1 black, 6 black and white around them that prove the timing, 2 times" in printed
     assert "99.0% of lit pixels, 20.0% keep a point" in printed
     assert "(7 px and more from edges)" in printed
     assert "+-0.144 mm at 700 mm" in printed
