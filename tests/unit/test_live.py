@@ -381,12 +381,9 @@ def test_frames_without_a_pattern_are_results_with_words(work: tuple[LiveWork, l
 def test_the_line_counts_the_points_that_are_sent() -> None:
     xyz = np.full((4, 6, 3), np.nan, np.float32)
     xyz[:3] = 500.0
-    thinned = client_live.LiveFrame(
-        head(1, content="xyz", width=6, height=4, dtype="float32", stride=2, points=70), xyz, 0
-    )
-    whole = client_live.LiveFrame(
-        head(1, content="xyz", width=6, height=4, dtype="float32", stride=1, points=18), xyz, 0
-    )
+    members = {"content": "xyz", "width": 6, "height": 4, "dtype": "float32"}
+    thinned = client_live.LiveFrame(head(1, **members, stride=2, points=70), xyz, 0)
+    whole = client_live.LiveFrame(head(1, **members, stride=1, points=18), xyz, 0)
     run = dict.fromkeys(("frames_per_s", "results_per_s", "dropped", "lost"), 1)
     run |= {"points": 70, "retain": "none", "problem": None, "latency_ms": {"p50": 1.0, "p99": 2.0}}
     assert "  18 points sent of 70" in figures(run, sent_points(thinned))
