@@ -6,21 +6,17 @@ depth z on the camera's ray is seen (implicit function theorem), and the varianc
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from scanner.covariance import LENS_MEMBERS, read_covariance
 from scanner.geometry import Array, Calibration, Lens
 from scanner.scan import Scan
 
 POINTS = 49
 """Points asked, spread over those that the scan has."""
-
-LENS_MEMBERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 
 
 def depth_spread(calibration: Calibration, scan: Scan, axis: str) -> float | None:
@@ -29,10 +25,13 @@ def depth_spread(calibration: Calibration, scan: Scan, axis: str) -> float | Non
     Args:
         scan: with points. axis: whose coordinates told their depth.
     """
-    read = _covariance(calibration.extra.get("covariance"))
+    try:
+        read = read_covariance(calibration.extra.get("covariance"))
+    except ValueError:  # said when the file was read
+        return None
     if read is None or scan.xyz is None:
         return None
-    names, matrix = read
+    names, matrix = read.names, read.matrix
     valid = np.flatnonzero(scan.valid)
     if valid.size == 0:
         return None
@@ -82,21 +81,3 @@ def _moved_lens(lens: Lens, member: str, step: float) -> Lens:
     else:
         matrix[(0, 1, 0, 1)[at], (0, 1, 2, 2)[at]] += step
     return Lens(lens.size, matrix, distortion)
-
-
-def _covariance(content: Any) -> tuple[list[str], NDArray[np.float64]] | None:
-    """Names and matrix of a calibration file's "covariance"; None where there is none that can be used."""
-    if not isinstance(content, Mapping):
-        return None
-    names = content.get("parameters")
-    known = {f"{part}.{member}" for part in ("camera", "projector") for member in LENS_MEMBERS}
-    known |= {f"{part}.{member}" for part in ("rotation", "translation") for member in "xyz"}
-    if not isinstance(names, list) or not names or not all(isinstance(n, str) and n in known for n in names):
-        return None
-    try:
-        matrix = np.asarray(content.get("matrix"), dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
-    if matrix.shape != (len(names), len(names)) or not np.isfinite(matrix).all():
-        return None
-    return names, matrix

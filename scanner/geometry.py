@@ -10,13 +10,15 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.covariance import read_covariance
+from scanner.credible import check_response, lens_warnings, rig_warnings
 from scanner.errors import CalibrationError
 from scanner.kernel import kernel
 
@@ -24,9 +26,6 @@ Array = NDArray[np.float64]
 
 FORMAT = "fringed-calibration"
 VERSION = 1
-
-MOST_DISTORTION = 2.5
-"""Factor by which distortion may move the middle of an image's edge towards or away from the centre."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +92,8 @@ class Calibration:
     """(3,) mm"""
     id: str = ""
     extra: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    """what is odd about its file, in words for reports"""
 
     def to_projector(self, points: NDArray[Any]) -> Array:
         """(..., 3) mm in the camera's frame to (..., 3) mm in the projector's."""
@@ -167,7 +168,9 @@ def load_calibration(path: Path) -> Calibration:
         raise CalibrationError(f"cannot read calibration {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
         raise CalibrationError(f"{path} is not JSON: {error}") from error
-    return calibration_from_dict(content, name=str(path))
+    found = calibration_from_dict(content, name=str(path))
+    # Errors say where the file is; warnings go into reports, which are read elsewhere.
+    return replace(found, warnings=tuple(said.replace(str(path), path.name) for said in found.warnings))
 
 
 def calibration_from_dict(content: Any, name: str = "calibration") -> Calibration:
@@ -187,16 +190,26 @@ def calibration_from_dict(content: Any, name: str = "calibration") -> Calibratio
     if content.get("units", "mm") != "mm":
         raise CalibrationError(f"{name}: units are {content['units']!r:.80}, lengths must be in mm")
     _check_optional(content, name)
-    lenses = {side: _lens(content.get(side), f"{name}: {side}") for side in ("camera", "projector")}
+    camera, projector = (_lens(content.get(side), f"{name}: {side}") for side in ("camera", "projector"))
+    odd = [*lens_warnings(camera, f"{name}: camera"), *lens_warnings(projector, f"{name}: projector")]
     rotation = _matrix(content.get("rotation"), (3, 3), f"{name}: rotation")
     translation = _matrix(content.get("translation"), (3,), f"{name}: translation")
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
-        raise CalibrationError(f"{name}: rotation is not a rotation (orthonormal, determinant +1)")
+        raise CalibrationError(
+            f"{name}: rotation is not a rotation (orthonormal, determinant +1): its determinant is "
+            f"{np.linalg.det(rotation):.4g}",
+            hint="nine numbers, unrounded; where a picture is mirrored, mirror it in the rig file",
+        )
     if np.linalg.norm(translation) < 1e-9:
-        raise CalibrationError(f"{name}: translation is zero: projector and camera cannot stand at the same place")
+        raise CalibrationError(
+            f"{name}: translation is zero: projector and camera cannot stand at the same place",
+            hint="a file from before the rig was calibrated? fringed calibrate run or solve makes one",
+        )
     known = {"format", "version", "id", "camera", "projector", "rotation", "translation"}
     extra = {key: value for key, value in content.items() if key not in known}
-    return Calibration(**lenses, rotation=rotation, translation=translation, id=str(content.get("id", "")), extra=extra)
+    rig = Calibration(camera, projector, rotation, translation, id=str(content.get("id", "")), extra=extra)
+    odd += [*rig_warnings(rig, name), *_covariance_warnings(content, name)]
+    return replace(rig, warnings=tuple(odd))
 
 
 def warm_up() -> None:
@@ -266,7 +279,7 @@ def _lens(content: Any, name: str) -> Lens:
     if not isinstance(content, dict):
         raise CalibrationError(f"{name} is missing")
     size = content.get("size")
-    if not (isinstance(size, list) and len(size) == 2 and all(isinstance(n, int) and n > 0 for n in size)):
+    if not (isinstance(size, list) and len(size) == 2 and all(type(n) is int and n > 0 for n in size)):
         raise CalibrationError(f"{name}.size must be [width, height] in pixels, got {size!r}")
     matrix = _matrix(content.get("matrix"), (3, 3), f"{name}.matrix")
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or abs(np.linalg.det(matrix)) < 1e-9:
@@ -274,26 +287,19 @@ def _lens(content: Any, name: str) -> Lens:
     if np.abs(matrix[1, 0]) > 0 or np.abs(matrix[2] - (0, 0, 1)).max() > 0:
         raise CalibrationError(f"{name}.matrix must be upper triangular with last row 0 0 1")
     distortion = _matrix(content.get("distortion", [0.0] * 5), (5,), f"{name}.distortion")
-    lens = Lens((size[0], size[1]), matrix, distortion)
-    _check_distortion(lens, name)
-    return lens
+    return Lens((size[0], size[1]), matrix, distortion)
 
 
-def _check_distortion(lens: Lens, name: str) -> None:
-    """Raise CalibrationError where the image's edges lie beyond the distortion's fold or are moved absurdly far."""
-    width, height = lens.size
-    middles = np.array(
-        [(0, (height - 1) / 2), (width - 1, (height - 1) / 2), ((width - 1) / 2, 0), ((width - 1) / 2, height - 1)]
-    )
-    seen = Lens(lens.size, lens.matrix, np.zeros(5)).normalised(middles)
-    true = lens.normalised(middles)
-    share = np.linalg.norm(true, axis=1) / np.maximum(np.linalg.norm(seen, axis=1), 1e-9)
-    # Written so that NaN, beyond the fold, fails too. A lens of 120 degrees moves its edges by half their radius.
-    if not np.all((share > 1 / MOST_DISTORTION) & (share < MOST_DISTORTION)):
-        raise CalibrationError(
-            f"{name}.distortion {lens.distortion.tolist()} folds the image or moves its edges too far",
-            hint="calibrate again with fewer radial terms, or with targets out to the image's edges",
-        )
+def _covariance_warnings(content: Mapping[str, Any], name: str) -> list[str]:
+    """A calibration without its covariance measures as well: what is missing is what it says of its own error."""
+    try:
+        read_covariance(content.get("covariance"))
+    except ValueError as error:
+        return [
+            f"{name}: covariance cannot be read: {error}. What the calibration adds to the uncertainty of scans is "
+            "not known and missing from their budgets"
+        ]
+    return []
 
 
 def _check_optional(content: Mapping[str, Any], name: str) -> None:
@@ -321,6 +327,13 @@ def _check_optional(content: Mapping[str, Any], name: str) -> None:
         isinstance(response, dict) and all(side is None or isinstance(side, dict) for side in response.values())
     ):
         raise CalibrationError(f"{name}: response must be null or an object of sides, got {response!r:.80}")
+    if response is not None:
+        check_response(response, name)
+    residuals = content.get("residuals")
+    if residuals is not None and not isinstance(residuals, dict):
+        raise CalibrationError(f"{name}: residuals must be null or an object, got {residuals!r:.80}")
+    if residuals is not None and residuals.get("epipolar_px") is not None:
+        _matrix(residuals["epipolar_px"], (), f"{name}: residuals.epipolar_px")
 
 
 def _matrix(content: Any, shape: tuple[int, ...], name: str) -> Array:

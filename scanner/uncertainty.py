@@ -161,7 +161,9 @@ def _calibration(scan: Scan, calibration: Calibration, axis: Axis) -> Contributi
     spread = depth_spread(calibration, scan, axis)
     scale = calibration.extra.get("scale")
     if spread is None:
-        return Contribution("calibration", "systematic", None, None, "the calibration has no covariance")
+        has = calibration.extra.get("covariance") is not None
+        says = f"the calibration {'has no covariance that can be read' if has else 'has no covariance'}"
+        return Contribution("calibration", "systematic", None, None, says)
     unverified = "; its absolute scale is unverified" if scale == "unverified" else ""
     return Contribution("calibration", "systematic", None, spread, f"covariance of the calibration{unverified}")
 

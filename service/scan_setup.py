@@ -145,6 +145,8 @@ def open_rig(settings: Mapping[str, Any], clock: Clock) -> OpenRig:
     camera_part, projector_part, trigger_part = (settings[key] for key in ("camera", "projector", "trigger"))
     path = settings["rig"]["calibration"]
     calibration = None if path is None else load_calibration(Path(path))
+    for said in () if calibration is None else calibration.warnings:
+        _log.warning("%s", said)
     marks = _marks(settings["rig"].get("marks"))
     options = dict(projector_part["options"])
     if projector_part["mode"] is not None:

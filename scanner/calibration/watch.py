@@ -25,7 +25,8 @@ def watched(scan: Scan, calibration: Calibration | None, header: CaptureHeader) 
         CalibrationError: the capture's marks are not as they should be.
     """
     members: dict[str, Any] = {}
-    warnings = list(scan.report.get("warnings", ()))
+    odd = () if calibration is None else calibration.warnings
+    warnings = [*scan.report.get("warnings", ()), *odd]
     if (warm_up := header.extra.get(WARM_UP)) is not None:
         members["warm_up"] = warm_up
     if calibration is not None and scan.xyz is not None:
@@ -39,4 +40,4 @@ def watched(scan: Scan, calibration: Calibration | None, header: CaptureHeader) 
             found = measured_marks(parse_marks(given, f"{MARKS} of the capture"), scan.albedo, scan.xyz)
             members["marks"] = found
             warnings += [found["warning"]] if found["warning"] else []
-    return scan.with_report(**members, warnings=warnings) if members else scan
+    return scan.with_report(**members, warnings=warnings) if members or odd else scan

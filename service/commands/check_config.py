@@ -29,18 +29,23 @@ def check_config(
 
     rig, problems = (load_rig(file), []) if is_simulated(file) else check_rig(Path(file))
     lines = [str(problem) for problem in problems]
+    odd: list[str] = []
     if rig is not None:
-        lines += _calibration_problems(rig, file)
+        found, odd = _calibration_problems(rig, file)
+        lines += found
     if as_json:
         print_json(
             {
                 "ok": not lines,
                 "problems": [asdict(problem) for problem in problems] or lines,
+                "warnings": odd,
                 "rig": None if rig is None else rig.model_dump(mode="json"),
             }
         )
     for line in lines:
         print_error(line)
+    for line in odd:
+        print_error(line, label="warning")
     if lines or rig is None:
         return 1
     if not as_json:
@@ -48,17 +53,19 @@ def check_config(
     return 0
 
 
-def _calibration_problems(rig: RigConfig, file: str) -> list[str]:
+def _calibration_problems(rig: RigConfig, file: str) -> tuple[list[str], list[str]]:
+    """What is wrong with the rig's calibration, and what is odd about it."""
     if rig.rig.calibration is None:
-        return []
+        return [], []
     from scanner.errors import CalibrationError  # noqa: PLC0415
     from scanner.geometry import load_calibration  # noqa: PLC0415
 
+    where = f"{file}: rig.calibration"
     try:
-        load_calibration(rig.rig.calibration)
+        calibration = load_calibration(rig.rig.calibration)
     except CalibrationError as error:
-        return [f"{file}: rig.calibration: {error}"]
-    return []
+        return [f"{where}: {error}" + (f" ({error.hint})" if error.hint else "")], []
+    return [], [f"{where}: {said}" for said in calibration.warnings]
 
 
 def _meaning(rig: RigConfig) -> list[tuple[str, Any]]:
