@@ -310,5 +310,10 @@ def test_mcp_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert main([*words, "--calibration", str(old), "-o", str(new)]) == 2
     assert main([*words, "-o", str(new)]) == 2
     assert main(words) == 0
-    assert "row = 27.0" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "row = 27.0" in said.out
+    assert "differ" not in said.err
+    off = str(save(tmp_path / "off", None, rows=rows + np.float32(0.4)))
+    assert main(["calibrate", "mcp", off, str(single)]) == 0
+    assert "stripes and PMP rows differ by up to 0.40 rows" in capsys.readouterr().err
     assert main(["calibrate", "mcp", dense, dense]) == 1
