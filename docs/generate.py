@@ -117,12 +117,21 @@ def _commands_of(group: Any, before: str) -> Iterator[str]:
         positional = [p for p in command.params if p.param_type_name == "argument"]
         options = [p for p in command.params if p.param_type_name == "option"]
         usage = " ".join(["fringed", name, *(p.metavar or p.name.upper() for p in positional), "[OPTIONS]"])
-        yield f"\n## {name}\n\n    {usage}\n\n{text.strip()}\n\n"
+        yield f"\n## {name}\n\n    {usage}\n\n{_prose(text)}\n\n"
         if rows := [f"| `{p.metavar or p.name.upper()}` | {p.help or ''} |\n" for p in positional]:
             yield "| Argument | |\n|---|---|\n" + "".join(rows) + "\n"
         if rows := [_option(option) for option in options]:
             yield "| Option | | Default |\n|---|---|---|\n" + "".join(rows) + "\n"
         yield "Examples:\n\n" + "".join(f"    {line.strip()}\n" for line in examples.strip().splitlines())
+
+
+def _prose(text: str) -> str:
+    """A command's help; its paragraphs that must keep their lines as code."""
+    paragraphs = text.strip().split("\n\n")
+    return "\n\n".join(
+        "\n".join(f"    {line}" for line in part.splitlines()[1:]) if part.startswith("\b\n") else part
+        for part in paragraphs
+    )
 
 
 def _option(option: Any) -> str:

@@ -199,7 +199,7 @@ def _picture(comparison: Comparison) -> Picture:
     text(picture, "Error against truth", (x, 46), size=26, weight=600)
     text(picture, _caption(comparison), (x, 78), size=17, colour=DIM)
     picture[60:76, 1180:1196] = _UNDECIDED
-    text(picture, "lit, undecided", (1206, 74), size=15, colour=DIM)
+    text(picture, "lit (truth), undecided", (1206, 74), size=15, colour=DIM)
     return picture
 
 
@@ -211,7 +211,7 @@ def _caption(comparison: Comparison) -> str:
     return (
         f"inside: rms {errors.rms:.3f} {comparison.unit}, 99 % below {errors.p99:.3f} {comparison.unit}, "
         f"{grouped(inner.wrong)} wrong of {grouped(inner.decided)};  "
-        f"{100 * comparison.lit.coverage:.2f} % of what is lit"
+        f"{100 * comparison.lit.coverage:.2f} % of what is lit (truth)"
     )
 
 

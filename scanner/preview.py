@@ -92,7 +92,7 @@ def _figures(scan: Scan) -> list[tuple[str, str]]:
     figures = [(grouped(count), "points" if scan.xyz is not None else "pixels decoded")]
     if (lit := int(np.count_nonzero(scan.lit))) > 0:
         share = count / lit if scan.xyz is not None else scan.coverage
-        figures.append((f"{100 * share:.1f} %", "of what is lit"))
+        figures.append((f"{100 * share:.1f} %", "of where the pattern shows"))
     if scan.xyz is not None and (depth := _sample(scan.xyz[..., 2])).size:
         low, high = np.percentile(depth, (1, 99))
         figures.append((f"{grouped(low)} … {grouped(high)}", "mm depth"))

@@ -26,6 +26,15 @@ class Drawing:
     height_mm: float
     ruler_mm: float
 
+    @property
+    def page(self) -> str | None:
+        """The smallest page (ISO 216, either way round) that holds it; None beyond A0."""
+        short, long = sorted((self.width_mm, self.height_mm))
+        return next((name for name, (a, b) in PAGES_MM.items() if short <= a and long <= b), None)
+
+
+PAGES_MM = {"A4": (210, 297), "A3": (297, 420), "A2": (420, 594), "A1": (594, 841), "A0": (841, 1189)}
+
 
 def target_svg(target: Target, grey: float = 0.0) -> Drawing:
     """Draw a flat target.

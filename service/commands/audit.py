@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.commands.options import AsJson, Force, output_path
+from service.commands.calibrate_solve import Replace
+from service.commands.options import AsJson, output_path
 from service.terminal import print_error, print_facts, print_json, print_table, progress_lines
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def audit(
             "-o", "--output", metavar="FILE", parser=output_path, help="Draw the timing diagram: .svg or .png."
         ),
     ] = None,
-    force: Force = False,
+    force: Replace = False,
     as_json: AsJson = False,
 ) -> int:
     """Verify a capture again: stamps and content of every frame against the plan.
@@ -39,7 +40,7 @@ def audit(
     \b
     Examples:
       fringed audit scan
-      fringed audit scan -o timing.svg
+      fringed audit scan -o scans/timing.svg
     """
     if output is not None and output.suffix not in (".svg", ".png"):
         raise typer.BadParameter(f"-o: expected a name that ends in .svg or .png, got {str(output)!r}")

@@ -22,7 +22,8 @@ def marks(
         typer.Option(metavar="X,Y", help="Camera pixel on or beside a disc; three times or more."),
     ] = None,
     plate: Annotated[
-        str | None, typer.Option(metavar="X,Y,W,H", help="Part of the camera's picture that shows a flat plate alone.")
+        str | None,
+        typer.Option(metavar="X,Y,W,H", help="Part of the camera's picture, pixels, that shows a flat plate alone."),
     ] = None,
     force: Replace = False,
     as_json: AsJson = False,
@@ -34,8 +35,8 @@ def marks(
 
     \b
     Examples:
+      fringed calibrate marks scan --plate 20,20,160,120 -o scans/marks.json      the simulated wall as plate
       fringed calibrate marks today/ --at 80,90 --at 1300,95 --at 690,980 -o marks.json
-      fringed calibrate marks today/ --plate 20,20,160,120 -o marks.json
     """
     if output.exists() and not force:
         raise typer.BadParameter(f"-o: {output} exists; --force replaces it")
@@ -46,8 +47,9 @@ def marks(
         from scanner.calibration.marks import reference_marks  # noqa: PLC0415
         from scanner.errors import DecodeError  # noqa: PLC0415
         from scanner.scan import load_scan  # noqa: PLC0415
-        from scanner.storage import replace_json  # noqa: PLC0415
+        from scanner.storage import replace_json, try_file  # noqa: PLC0415
 
+        try_file(output)
         opened = load_scan(scan)
         if opened.xyz is None:
             raise DecodeError(

@@ -22,7 +22,7 @@ def response(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="SOURCE", help="A PMP capture, a rig (a file, or simulated[:SCENE]), or a folder of images."
+            metavar="SOURCE", help="A PMP capture or scan, a rig (a file, or simulated[:SCENE]), or a folder of images."
         ),
     ],
     levels: Annotated[
@@ -42,12 +42,15 @@ def response(
 
     \b
     Examples:
-      fringed calibrate response scan/capture
+      fringed calibrate response scan
+      fringed calibrate response simulated
       fringed calibrate response bench.toml --write calibration.json
       fringed calibrate response levels/ --levels 0,32,64,96,128,160,192,224,255 --json
     """
     from service.config import is_simulated  # noqa: PLC0415
 
+    if write is not None:
+        _try(write)
     with progress_lines() as lines:
         found: LevelResponse | Response
         if levels is not None:
@@ -122,10 +125,19 @@ def _projector_response(found: LevelResponse | Response) -> dict[str, Any] | Non
     return found.response
 
 
+def _try(path: Path) -> None:
+    """What is measured will have to go in there."""
+    from scanner.geometry import load_calibration  # noqa: PLC0415
+    from scanner.storage import try_file  # noqa: PLC0415
+
+    load_calibration(path)
+    try_file(path)
+
+
 def _write(path: Path, of_projector: dict[str, Any] | None) -> None:
     from scanner.calibration.calibration_file import as_text, content_id  # noqa: PLC0415
     from scanner.errors import CalibrationError  # noqa: PLC0415
-    from scanner.geometry import load_calibration  # noqa: PLC0415
+    from scanner.geometry import calibration_from_dict  # noqa: PLC0415
     from scanner.storage import replace_file  # noqa: PLC0415
 
     if of_projector is None:
@@ -133,11 +145,11 @@ def _write(path: Path, of_projector: dict[str, Any] | None) -> None:
             "the capture was projected through a table, which an exponent cannot be put in place of",
             hint="measure by grey levels: fringed calibrate response RIG.toml --write FILE",
         )
-    load_calibration(path)
     content = json.loads(path.read_text(encoding="utf-8"))
     camera = (content.get("response") or {}).get("camera")
     content["response"] = {"projector": of_projector, "camera": camera}
     content["id"] = content_id(content)
+    calibration_from_dict(content, name=f"{path} with this response")
     replace_file(path, as_text(content).encode())
 
 

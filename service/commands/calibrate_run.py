@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands.calibrate_solve import TARGET_HELP, length_given, report
+from service.commands.calibrate_solve import LENGTH_HELP, TARGET_HELP, length_given, report
 from service.commands.options import AsJson, Connect, output_path
 from service.terminal import progress_lines
 
@@ -46,7 +46,11 @@ def run(
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", metavar="DIR", parser=output_path, help="Folder; poses in it are taken up again."
+            "-o",
+            "--output",
+            metavar="DIR",
+            parser=output_path,
+            help="Folder; poses in it are taken up again. Default: calibration-DATE-TIME.",
         ),
     ] = None,
     auto: Annotated[
@@ -61,7 +65,7 @@ def run(
         str | None,
         typer.Option(
             metavar="MM[:SIGMA]",
-            help="Measured length of the target's longest row of points, end to end, and its 1-sigma (0.1 mm).",
+            help=LENGTH_HELP,
         ),
     ] = None,
     rigid: Annotated[
@@ -69,13 +73,19 @@ def run(
     ] = False,
     baseline: Annotated[
         float | None,
-        typer.Option(metavar="MM", min=1, max=1e5, help="Distance from lens to lens by a rule, to check by."),
+        typer.Option(
+            metavar="MM", min=1, max=1e5, help="Distance from lens to lens by a rule, mm: off by 15 % is refused."
+        ),
     ] = None,
     distance: Annotated[
-        float | None, typer.Option(metavar="MM", min=1, max=1e6, help="Distance of the targets by a rule, to check by.")
+        float | None,
+        typer.Option(
+            metavar="MM", min=1, max=1e6, help="Distance of the targets by a rule, mm: off by 15 % is refused."
+        ),
     ] = None,
     warm_up: Annotated[
-        float | None, typer.Option(metavar="MINUTES", min=0, max=1e5, help="How long the rig had been on; is recorded.")
+        float | None,
+        typer.Option(metavar="MINUTES", min=0, max=1e5, help="How long the rig had been on, minutes; is recorded."),
     ] = None,
     write: Annotated[
         bool, typer.Option("--write", help="Name the calibration in the rig file (a copy is kept beside it).")
@@ -90,13 +100,14 @@ def run(
 
     \b
     Examples:
+      fringed calibrate run "simulated:casey2011/charuco_poses?walk=true" --target charuco:10x7:30 --auto -o scans/rig
       fringed calibrate run bench.toml --target charuco:10x7:30 --length 240.1:0.05 -o bench-calibration
       fringed calibrate run bench.toml --target charuco:10x7:30 --auto --write
-      fringed calibrate run "simulated:casey2011/charuco_poses?walk=true" --target charuco:10x7:30
     """
     from scanner.calibration.solve import SolveOptions  # noqa: PLC0415
     from scanner.calibration.targets import parse_target  # noqa: PLC0415
     from scanner.errors import ConfigError  # noqa: PLC0415
+    from scanner.storage import storage_errors, try_file  # noqa: PLC0415
     from service.config import is_simulated  # noqa: PLC0415
 
     if (rig is None) == (connect is None):
@@ -114,7 +125,10 @@ def run(
     result = folder / CALIBRATION_FILE
     if result.exists() and not force:
         raise typer.BadParameter(f"-o: {result} exists; --force goes on with its poses and replaces it")
-    folder.mkdir(parents=True, exist_ok=True)
+    with storage_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    for path in (result, picture or folder / LIVE_PICTURE, *((Path(rig),) if write and rig is not None else ())):
+        try_file(path)
     solution, response = _guided(
         rig, connect, looked_for, options, _Asked(folder, picture or folder / LIVE_PICTURE, poses, auto)
     )

@@ -20,6 +20,9 @@ TARGET_HELP = (
     "chessboard:9x6:30 (inner corners, mm), charuco:10x7:30[:MARKER[:DICT]] (squares), circles:COLSxROWS:MM[:DIAM], "
     "acircles:COLSxROWS:MM[:DIAM], wedge:FILE."
 )
+LENGTH_HELP = (
+    "Measured length of the target's longest row of points, from the first to the last, mm, and its 1-sigma (else 0.1)."
+)
 
 
 class Model(StrEnum):
@@ -48,7 +51,7 @@ def solve(
         str | None,
         typer.Option(
             metavar="MM[:SIGMA]",
-            help="Measured length of the target's longest row of points, end to end, and its 1-sigma (0.1 mm).",
+            help=LENGTH_HELP,
         ),
     ] = None,
     rigid: Annotated[
@@ -57,15 +60,21 @@ def solve(
     baseline: Annotated[
         float | None,
         typer.Option(
-            metavar="MM", min=1, max=1e5, help="Distance from lens to lens by a rule, to check the result by."
+            metavar="MM",
+            min=1,
+            max=1e5,
+            help="Distance from lens to lens by a rule, mm: a result off by 15 % is refused.",
         ),
     ] = None,
     distance: Annotated[
         float | None,
-        typer.Option(metavar="MM", min=1, max=1e6, help="Distance of the targets by a rule, to check the result by."),
+        typer.Option(
+            metavar="MM", min=1, max=1e6, help="Distance of the targets by a rule, mm: a result off by 15 % is refused."
+        ),
     ] = None,
     warm_up: Annotated[
-        float | None, typer.Option(metavar="MINUTES", min=0, max=1e5, help="How long the rig had been on; is recorded.")
+        float | None,
+        typer.Option(metavar="MINUTES", min=0, max=1e5, help="How long the rig had been on, minutes; is recorded."),
     ] = None,
     picture: Annotated[
         bool, typer.Option("--picture/--no-picture", help="Draw residuals and coverage to FILE's name with .png.")
@@ -80,7 +89,9 @@ def solve(
 
     \b
     Examples:
-      fringed calibrate solve poses/ --target chessboard:9x6:30 -o rig.json
+    After the simulated run of fringed calibrate run --help:
+      fringed calibrate solve scans/rig/poses --target charuco:10x7:30 --length 240:0.05 -o scans/rig.json
+    With captures of your own:
       fringed calibrate solve p1 p2 p3 p4 --target charuco:10x7:30 --length 240.1:0.05 -o rig.json
       fringed calibrate solve poses/ --target chessboard:9x6:30 --baseline 240 -o rig.json --json
       fringed calibrate solve wedge/ --target wedge:wedge.json --model hall -o rig.json
@@ -99,9 +110,10 @@ def solve(
         from scanner.calibration.solve import solve as solve_pinhole  # noqa: PLC0415
         from scanner.calibration.solve_hall import solve_hall  # noqa: PLC0415
         from scanner.calibration.targets import parse_target  # noqa: PLC0415
-        from scanner.storage import replace_file  # noqa: PLC0415
+        from scanner.storage import replace_file, try_file  # noqa: PLC0415
 
         looked_for = parse_target(target)
+        try_file(output)
         paths = find_captures(captures)
         lines.stage("looking for the target", len(paths))
         observations, left_out = observe(

@@ -30,11 +30,12 @@ def sync(
 
     \b
     Examples:
-      fringed calibrate sync bench.toml
+      fringed calibrate sync simulated
       fringed calibrate sync bench.toml --write
     """
     from scanner.clock import MonotonicClock  # noqa: PLC0415
     from scanner.errors import ConfigError  # noqa: PLC0415
+    from scanner.storage import try_file  # noqa: PLC0415
     from service.config import is_simulated, load_rig  # noqa: PLC0415
     from service.rig_file_edit import set_values  # noqa: PLC0415
     from service.sync_measure import measure_sync  # noqa: PLC0415
@@ -42,6 +43,8 @@ def sync(
     if write and is_simulated(rig):
         raise ConfigError("the simulated rig has no file to write to", hint="leave --write out")
     config = load_rig(rig)
+    if write:
+        try_file(Path(rig))
     with progress_lines() as progress:
         found = measure_sync(config, MonotonicClock(), progress.stage)
     if found.is_poor:

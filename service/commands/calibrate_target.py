@@ -28,14 +28,17 @@ def target(
 ) -> int:
     """Draw a target to print at 100 %, with a ruler that shows whether it was.
 
+    The drawing is as large as the target, half a square of margin, and a ruler below: the answer names the page for it.
+
     Dark grey squares (--grey 0.35) keep the fringes visible on them, which helps the projector's half of the
     calibration; markers are found on black best.
 
     \b
     Examples:
-      fringed calibrate target chessboard:9x6:30 -o board.svg --grey 0.35
-      fringed calibrate target charuco:10x7:30 -o board.svg
-      fringed calibrate target acircles:4x11:20 -o dots.svg
+      fringed calibrate target chessboard:9x6:30 -o scans/chessboard.svg --grey 0.35
+      fringed calibrate target charuco:10x7:30 -o scans/charuco.svg         330 x 262 mm: A3
+      fringed calibrate target charuco:10x7:22 -o scans/charuco-a4.svg      242 x 198 mm: A4
+      fringed calibrate target acircles:4x11:20 -o scans/dots.svg
     """
     if output.suffix != ".svg":
         raise typer.BadParameter(f"-o: expected a name that ends in .svg, got {str(output)!r}")
@@ -52,6 +55,7 @@ def target(
     facts = {
         "file": str(output),
         "paper_mm": [round(drawing.width_mm, 3), round(drawing.height_mm, 3)],
+        "page": drawing.page,
         "ruler_mm": drawing.ruler_mm,
         "length_mm": chosen.longest_mm,
     }
@@ -62,7 +66,8 @@ def target(
         "target",
         [
             ("file", output),
-            ("paper", f"{drawing.width_mm:g} x {drawing.height_mm:g} mm; print at 100 %, no fitting to the page"),
+            ("paper", f"{drawing.width_mm:g} x {drawing.height_mm:g} mm: {drawing.page or 'larger than A0'}"),
+            ("print", "at 100 %, no fitting to the page"),
             ("check", f"the ruler must be {drawing.ruler_mm:g} mm long"),
             ("measure", f"first to last point of the longest row, nominally {chosen.longest_mm:g} mm (--length)"),
         ],

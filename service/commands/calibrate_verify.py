@@ -25,7 +25,9 @@ def verify(
     flat: Annotated[bool, typer.Option("--flat", help="A flat board: flatness, rms, bow.")] = False,
     sphere: Annotated[
         float | None,
-        typer.Option(metavar="MM", min=0.1, max=1e5, help="A sphere of this diameter: form and size error."),
+        typer.Option(
+            metavar="MM", min=0.1, max=1e5, help="A sphere of this diameter (not radius), mm: form and size error."
+        ),
     ] = None,
     target: Annotated[
         str | None,
@@ -44,17 +46,22 @@ def verify(
     ] = None,
     edge: Annotated[
         str | None,
-        typer.Option(metavar="X,Y,W,H", help="Part of the picture with one straight edge in depth: 10-90 % width."),
+        typer.Option(
+            metavar="X,Y,W,H",
+            help="Part of the picture, camera pixels, with one straight edge in depth: 10-90 % width.",
+        ),
     ] = None,
     tolerance: Annotated[
         float | None, typer.Option(metavar="MM", min=0, max=1e4, help="Exit status 1 if an error is larger than this.")
     ] = None,
     as_json: AsJson = False,
 ) -> int:
-    """Measure known features in scans, in the words of VDI/VDE 2634 part 2.
+    """Measure known features in scans, in the words of VDI/VDE 2634 part 2. All lengths are mm.
 
     \b
     Examples:
+      fringed scan --rig simulated:casey2011/sphere_board -o scans/ball       something to verify
+      fringed calibrate verify scans/ball --sphere 160 --flat --tolerance 1
       fringed calibrate verify board/ --flat --tolerance 0.2
       fringed calibrate verify ball1 ball2 ball3 --sphere 50.012
       fringed calibrate verify target/ --target charuco:10x7:30 --length 240.05
@@ -128,7 +135,9 @@ def mcp(
 
     \b
     Examples:
-      fringed calibrate mcp board-pmp/ board-mcp/
+      fringed scan --rig simulated:casey2011/board -o scans/board-pmp
+      fringed scan --rig simulated:casey2011/board --method mcp -o scans/board-mcp
+      fringed calibrate mcp scans/board-pmp scans/board-mcp
       fringed calibrate mcp board-pmp/ board-mcp/ --calibration rig.json -o rig-mcp.json
     """
     if (calibration is None) != (output is None):
@@ -138,8 +147,10 @@ def mcp(
     from scanner.calibration.calibration_file import as_text, content_id  # noqa: PLC0415
     from scanner.calibration.mcp_phase import NOTABLE_PX, mcp_phase  # noqa: PLC0415
     from scanner.geometry import load_calibration  # noqa: PLC0415
-    from scanner.storage import replace_file  # noqa: PLC0415
+    from scanner.storage import replace_file, try_file  # noqa: PLC0415
 
+    if output is not None:
+        try_file(output)
     rows, peaks, pitch, axis = _both(pmp, single)
     fit = mcp_phase(rows, peaks, pitch, axis=axis)
     if calibration is not None and output is not None:

@@ -23,7 +23,8 @@ def check_config(
 
     \b
     Examples:
-      fringed check-config bench.toml
+      fringed check-config docs/examples/rig.toml
+      fringed check-config simulated:quick/board --json
     """
     from service.config import check_rig, is_simulated, load_rig  # noqa: PLC0415
 

@@ -16,15 +16,21 @@ def daemon(
         typer.Option("--endpoint", metavar="ENDPOINT", help="Listen here instead of the rig file's endpoint."),
     ] = None,
     state: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder for jobs and captures that outlive the daemon.")
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for jobs and captures that outlive the daemon. Default: $STATE_DIRECTORY, else "
+            "/var/lib/fringed for root, ~/.local/state/fringed for others.",
+        ),
     ] = None,
 ) -> int:
     """Drive a rig and answer clients, until told to stop.
 
     \b
     Examples:
-      fringed daemon /etc/fringed/rig.toml
       fringed daemon simulated --endpoint ipc:///tmp/try.ipc --state /tmp/try
+      fringed scan --connect ipc:///tmp/try.ipc            in another terminal
+      fringed daemon /etc/fringed/rig.toml
     """
     from service.config import load_rig  # noqa: PLC0415
     from service.daemon import run_daemon  # noqa: PLC0415
@@ -39,11 +45,14 @@ def daemon(
 def worker(
     connect: Annotated[str, typer.Option("--connect", metavar="ENDPOINT", help="The daemon's endpoint for workers.")],
 ) -> int:
-    """Decode for a daemon, beside the workers it starts itself.
+    """Decode for a daemon, beside the workers it starts itself, until told to stop.
+
+    Its endpoint for workers is worker.ipc beside the one for clients.
 
     \b
     Examples:
       fringed worker --connect ipc:///run/fringed/worker.ipc
+      fringed worker --connect ipc:///tmp/worker.ipc       of a daemon at ipc:///tmp/try.ipc
     """
     from service.logs import start_logging  # noqa: PLC0415
     from service.worker import run_worker  # noqa: PLC0415

@@ -25,12 +25,17 @@ from service.terminal import print_error, progress_lines
 
 
 def decode(
-    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture folder, or its JSON file.")],
+    capture: Annotated[
+        Path, typer.Argument(metavar="CAPTURE", help="A capture's or a scan's folder, a recording, or a JSON file.")
+    ],
     calibration: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Calibration to use instead of the capture's own.")
     ] = None,
     output: OutputFolder = None,
-    decoder: Annotated[str, typer.Option(metavar="NAME", help="Decoder, by name.")] = "default",
+    decoder: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="Decoder, by name: default, or casey2011 (mcp as published, a yardstick)."),
+    ] = "default",
     stages: Annotated[
         Path | None,
         typer.Option(
@@ -61,11 +66,12 @@ def decode(
 
     \b
     Examples:
-      fringed decode scan/capture -o again --no-edge-filter
-      fringed decode skull/capture-gray.json --calibration skull/calibration.json
-      fringed decode old/capture --depth 380:430 --force
-      fringed decode one-frame/capture -o published --decoder casey2011 --stages pictures
-      fringed decode take1 --frames 100:109                a recording of fringed live
+      fringed decode scan -o scans/unfiltered --no-edge-filter
+      fringed decode scan -o scans/near --depth 1000:1400
+      fringed decode skull/capture-gray.json --calibration skull/calibration.json     made elsewhere
+    After fringed scan --method mcp -o scans/one-frame, and fringed live --record scans/take1 --seconds 5:
+      fringed decode scans/one-frame -o scans/published --decoder casey2011 --stages scans/stages
+      fringed decode scans/take1 --frames 0:9
     """
     filters = filter_members(depth, box, min_confidence, edge_filter=edge_filter)
     began = time.monotonic()

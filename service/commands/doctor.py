@@ -25,8 +25,8 @@ def doctor(
     \b
     Examples:
       fringed doctor
-      fringed doctor bench.toml
-      fringed doctor simulated:quick/board --json
+      fringed doctor simulated:quick/board
+      fringed doctor bench.toml --json
     """
     from scanner.clock import MonotonicClock  # noqa: PLC0415
     from service.commands.daemon import state_folder  # noqa: PLC0415

@@ -72,7 +72,11 @@ def live(
         typer.Option(metavar="FILE", parser=output_path, help="A picture (png, jpg), made anew every second."),
     ] = None,
     exposure: Annotated[
-        str | None, typer.Option(metavar="auto|US", help="Exposure: microseconds, or auto (test shots first).")
+        str | None,
+        typer.Option(
+            metavar="auto|US",
+            help="Exposure: microseconds, or auto (test shots first). Default: the rig file's, else auto.",
+        ),
     ] = None,
     axis: AxisOption = None,
     bits: Bits = None,
@@ -97,7 +101,7 @@ def live(
       fringed live                                         the simulated rig, until Ctrl-C
       fringed live --rig bench.toml --picture now.png      and look at now.png
       fringed live --xyz --stride 2 --seconds 10 --json
-      fringed live --record take1 --seconds 30             then: fringed decode take1
+      fringed live --record scans/take1 --seconds 5        then: fringed decode scans/take1 --frames 0:9
     """
     if rig is not None and connect is not None:
         raise typer.BadParameter("--rig and --connect exclude each other: a running daemon has a rig of its own")
@@ -107,6 +111,10 @@ def live(
         raise typer.BadParameter("--stride thins points: give --xyz too")
     if picture is not None and picture.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise typer.BadParameter(f"--picture: expected a png or jpg file, got {str(picture)!r}")
+    if picture is not None:
+        from scanner.storage import try_file  # noqa: PLC0415
+
+        try_file(picture)
     members = PatternOptions(None, None, axis, bits, carriers, profile, levels).members(Method.MCP)
     params: dict[str, Any] = {
         "pattern": members or None,

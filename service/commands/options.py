@@ -29,7 +29,12 @@ OutputFolder = Annotated[
 ]
 Force = Annotated[bool, typer.Option("--force", help="Write into a folder that is not empty.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output, and nothing else.")]
-Connect = Annotated[str | None, typer.Option("--connect", metavar="ENDPOINT", help="Endpoint of a running daemon.")]
+Connect = Annotated[
+    str | None,
+    typer.Option(
+        "--connect", metavar="ENDPOINT", help="Endpoint of a running daemon, as ipc:///run/fringed/control.ipc."
+    ),
+]
 
 
 class Method(StrEnum):
@@ -49,27 +54,52 @@ DEFAULT_FREQUENCIES = 3
 
 Frequencies = Annotated[
     str | None,
-    typer.Option(metavar="F,F,...", help="PMP: cycles per projector height (width with --axis x), as 1,8,64."),
+    typer.Option(
+        metavar="F,F,...",
+        help="PMP: cycles per projector height (width with --axis x). Default: 1,8,64; less on small ones.",
+    ),
 ]
 Shifts = Annotated[
-    str | None, typer.Option(metavar="N[,N...]", help="PMP: shifts of every frequency, or one number for each.")
+    str | None,
+    typer.Option(
+        metavar="N[,N...]",
+        help="PMP: images of every frequency, 3 or more, or one number for each. Default: 8 (gray+pmp: 4).",
+    ),
 ]
 AxisOption = Annotated[
     str | None,
     typer.Option(metavar="x|y|xy", help="Phase direction: y measures projector rows, x columns. Default: the rig's."),
 ]
 Bits = Annotated[
-    int | None, typer.Option(metavar="N", min=1, max=16, help="MCP: bits of a code word; gray, gray+pmp: bits shown.")
+    int | None,
+    typer.Option(
+        metavar="N",
+        min=1,
+        max=16,
+        help="MCP: bits of a code word, with --carriers; gray, gray+pmp: bits shown. Default: chosen for the rig.",
+    ),
 ]
 Carriers = Annotated[
     str | None,
-    typer.Option(metavar="F,F,...", help="MCP: one carrier a bit, cycles along the stripes. CP: one a shift."),
+    typer.Option(
+        metavar="F,F,...",
+        help="MCP: one carrier a bit, cycles along the stripes; CP: one a shift. Default: chosen for the rig.",
+    ),
 ]
-Profile = Annotated[str | None, typer.Option(metavar="triangle|cosine", help="MCP: shape of a stripe.")]
-Levels = Annotated[str | None, typer.Option(metavar="equal|composite", help="MCP: equally bright, or as published.")]
+Profile = Annotated[
+    str | None, typer.Option(metavar="triangle|cosine", help="MCP: shape of a stripe. Default: triangle.")
+]
+Levels = Annotated[
+    str | None,
+    typer.Option(metavar="equal|composite", help="MCP: stripes equally bright, or as published. Default: equal."),
+]
 
 White = Annotated[
-    bool, typer.Option("--white", help="MCP: frames full on and off too, for textured scenes that stand still.")
+    bool,
+    typer.Option(
+        "--white",
+        help="MCP: full on and off too, for still, textured scenes: 9 frames with those that prove their order.",
+    ),
 ]
 
 
@@ -179,17 +209,27 @@ def _whole_numbers(text: str, name: str) -> list[int]:
 # --- filters ------------------------------------------------------------------------------------------------------
 
 Depth = Annotated[
-    str | None, typer.Option(metavar="NEAR:FAR", help="Keep points in this depth, mm; a side may be empty.")
+    str | None,
+    typer.Option(metavar="NEAR:FAR", help="Keep points this far from the camera, mm, as 400:700; a side may be empty."),
 ]
 Box = Annotated[
     str | None,
     typer.Option(metavar="X0:X1,Y0:Y1,Z0:Z1", help="Keep points in this box, mm, camera frame; sides may be empty."),
 ]
 MinConfidence = Annotated[
-    float | None, typer.Option(metavar="C", min=0.0, max=1.0, help="Keep points of at least this confidence.")
+    float | None,
+    typer.Option(
+        metavar="C",
+        min=0.0,
+        max=1.0,
+        help="Keep points of at least this confidence, 0 .. 1 (that it is no wrong fringe or stripe).",
+    ),
 ]
 EdgeFilter = Annotated[
-    bool, typer.Option("--edge-filter/--no-edge-filter", help="Take out points that fly at depth edges.")
+    bool,
+    typer.Option(
+        "--edge-filter/--no-edge-filter", help="Take out points that fly between two surfaces at depth edges."
+    ),
 ]
 
 

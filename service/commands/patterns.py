@@ -74,10 +74,10 @@ def patterns(
 
     \b
     Examples:
-      fringed patterns pmp -o images --size 1920x1080 --frequencies 1,8,64 --shifts 8 --axis x
-      fringed patterns mcp -o images --size 1152x864 --gamma 2.2
-      fringed patterns mcp -o images --for bench.toml
-      fringed patterns gray -o images --bits 10
+      fringed patterns pmp -o scans/pmp --size 1920x1080 --frequencies 1,8,64 --shifts 8 --axis x
+      fringed patterns mcp -o scans/mcp --size 1152x864 --gamma 2.2
+      fringed patterns mcp -o scans/mcp-bench --for simulated:bench2026     what a scan of that rig projects
+      fringed patterns gray -o scans/gray --bits 10
     """
     from scanner.errors import ScannerError  # noqa: PLC0415
     from scanner.storage import prepare_output, replace_json  # noqa: PLC0415

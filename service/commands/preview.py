@@ -30,28 +30,46 @@ def preview(
     ] = Path("preview.png"),
     rate: Annotated[float, typer.Option(metavar="HZ", min=0.1, max=60, help="Pictures a second.")] = 10.0,
     width: Annotated[
-        int, typer.Option(metavar="PX", min=16, max=8192, help="Widest picture; wider ones are thinned.")
+        int,
+        typer.Option(
+            metavar="PX",
+            min=16,
+            max=8192,
+            help="Widest picture, pixels; of wider ones every 2nd, 3rd, ... pixel is taken.",
+        ),
     ] = 1280,
-    seconds: Annotated[float | None, typer.Option(metavar="S", min=0, help="End by itself after so long.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", min=0, help="End by itself after so many seconds.")
+    ] = None,
     as_json: AsJson = False,
 ) -> int:
     """Look through the camera while the projector shows white. Ctrl-C ends it.
 
     Twice a second a picture file is written anew (open it in a viewer that follows changes), and a line tells how
-    bright and how sharp it is: aim, open the lens until nothing saturates, and turn the focus to the most sharpness.
+    bright and how sharp it is. Aim; open the lens as far as nothing saturates; turn the focus to the most sharpness.
+
+    \b
+    mean       of all pixels, share of the camera's range
+    bright     grey level that one pixel in 200 exceeds, share of the range; scans expose for 85% of it
+    saturated  share of the pixels at the top of the range, where it is more than 1 in 1000
+    sharpness  100 x rms slope of the picture over its mean level, noise taken off; without a unit, and good only for
+               comparing one focus with another in the same view. best: the largest so far
 
     \b
     Examples:
+      fringed preview --seconds 5                          the simulated rig
+      fringed preview --rig simulated --seconds 2 --json
       fringed preview --rig bench.toml
       fringed preview --connect ipc:///run/fringed/control.ipc -o now.jpg
-      fringed preview --rig simulated --seconds 2 --json
     """
     if rig is not None and connect is not None:
         raise typer.BadParameter("--rig and --connect exclude each other: a running daemon has a rig of its own")
     if picture.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise typer.BadParameter(f"--picture: expected a png or jpg file, got {str(picture)!r}")
     from scanner.client import Client  # noqa: PLC0415
+    from scanner.storage import try_file  # noqa: PLC0415
 
+    try_file(picture)
     watching = _Watching(picture)
     with progress_lines() as lines, rig_daemon(rig, connect, lines) as endpoint:
         lines.stage("preparing")

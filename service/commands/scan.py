@@ -54,11 +54,21 @@ def scan(
         str | None,
         typer.Option(metavar="RIG", help="A rig file, or simulated[:SCENE], as simulated:bench2026/sphere_board."),
     ] = None,
-    method: Annotated[Method, typer.Option(metavar="pmp|mcp|gray|gray+pmp|cp", help="What to project.")] = Method.PMP,
+    method: Annotated[
+        Method,
+        typer.Option(
+            metavar="pmp|mcp|gray|gray+pmp|cp",
+            help="What to project: phase shifts (pmp), one frame (mcp, cp), Gray code, or both.",
+        ),
+    ] = Method.PMP,
     output: OutputFolder = None,
     connect: Connect = None,
     exposure: Annotated[
-        str | None, typer.Option(metavar="auto|US", help="Exposure: microseconds, or auto (test shots first).")
+        str | None,
+        typer.Option(
+            metavar="auto|US",
+            help="Exposure: microseconds, or auto (test shots first). Default: the rig file's, else auto.",
+        ),
     ] = None,
     frequencies: Frequencies = None,
     shifts: Shifts = None,
@@ -69,7 +79,10 @@ def scan(
     levels: Levels = None,
     white: White = False,
     repeat: Annotated[
-        int, typer.Option(metavar="N", min=1, max=1000, help="Repetitions of the whole sequence, averaged.")
+        int,
+        typer.Option(
+            metavar="N", min=1, max=1000, help="Repetitions of the whole sequence, averaged: less random error."
+        ),
     ] = 1,
     depth: Depth = None,
     box: Box = None,
@@ -84,12 +97,15 @@ def scan(
 ) -> int:
     """Scan: project, capture, decode; a point cloud, a picture and a report.
 
-    Without --rig and --connect the rig is the simulated one. Without -o the folder is scan-DATE-TIME.
+    Without --rig and --connect the rig is the simulated one. Without -o the folder is scan-DATE-TIME. Besides the
+    pattern's own frames, a sequence has black and white ones around it and one of bars: they prove which frame saw
+    which pattern. One frame alone (mcp, cp) needs none.
 
     \b
     Examples:
       fringed scan                                         the simulated rig, PMP
-      fringed scan --method mcp -o out                     one frame
+      fringed scan --method mcp -o scans/one-frame         one frame
+      fringed scan --rig simulated:bench2026/sphere_board --compare-truth
       fringed scan --rig bench.toml --depth 400:700        real devices
       fringed scan --connect ipc:///run/fringed/control.ipc
       fringed scan --frequencies 1,8,64 --shifts 4,4,16 --json

@@ -59,7 +59,9 @@ def gige(
     Examples:
       fringed simulate gige
       fringed simulate gige quick/board --address 127.0.0.5 --loss 0.001
-      fringed simulate gige casey2011/bust --calibration rig.json
+      fringed simulate gige casey2011/bust --calibration scans/bust.json --light /tmp/bust.light
+    And in another terminal, with a copy of docs/examples/gige.toml in scans:
+      fringed scan --rig scans/gige.toml
     """
     from drivers.registry import load_simulator  # noqa: PLC0415
     from service.logs import start_logging  # noqa: PLC0415

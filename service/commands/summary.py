@@ -56,7 +56,7 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     if (lit := coverage.get("lit")) is not None:
         kept = coverage.get("points_of_lit") if report.get("depth_mm") or report.get("removed") else None
         points = f", {kept:.1%} keep a point" if kept is not None and round(kept, 3) != round(lit, 3) else ""
-        facts.append(("coverage", f"{lit:.1%} of lit pixels{points}"))
+        facts.append(("coverage", f"{lit:.1%} of the pixels in which the pattern shows{points}"))
     exposure = (report.get("capture") or {}).get("exposure") or {}
     if (used := exposure.get("used_us")) is not None:
         facts.append(("exposure", f"{used / 1000:.3f} ms{', chosen by test shots' * (exposure.get('mode') == 'auto')}"))

@@ -34,6 +34,20 @@ def test_generated_pages_are_current(generate: ModuleType) -> None:
         assert path.read_text() == text, f"{path.name} is not current: run `make docs`"
 
 
+def test_every_command_explains_its_options_and_has_an_example() -> None:
+    def leaves(group: Any, before: str) -> Iterator[tuple[str, Any]]:
+        for name, command in group.commands.items():
+            words = f"{before} {name}"
+            yield from leaves(command, words) if hasattr(command, "commands") else ((words, command),)
+
+    every = dict(leaves(typer.main.get_command(app), "fringed"))
+    assert len(every) > 20
+    for words, command in every.items():
+        examples = command.help.partition("Examples:")[2]
+        assert re.search(rf"^ +{words}\b", examples, flags=re.MULTILINE), words
+        assert [option.name for option in command.params if not option.help] == [], words
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page: Path) -> None:
     lost = [link for link, _ in LINK.findall(page.read_text()) if not (page.parent / link).exists()]

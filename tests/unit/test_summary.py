@@ -46,7 +46,7 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
     report_result(tmp_path, 1.0, {}, as_json=False)
     printed = capsys.readouterr().out
     assert "1 of the pattern, 1 white, 1 black, 6 black and white around them that prove the timing, 2 times" in printed
-    assert "99.0% of lit pixels, 20.0% keep a point" in printed
+    assert "99.0% of the pixels in which the pattern shows, 20.0% keep a point" in printed
     assert "(7 px and more from edges)" in printed
     assert "+-0.144 mm at 700 mm" in printed
     assert "0.070 mm random and 0.017 mm systematic" in printed
