@@ -165,7 +165,10 @@ class DaemonConfig(Table):
         description="path of the folder of clients' public keys, for encrypted endpoints; not used yet",
     )
     workers: int = Field(
-        default=1, ge=0, le=64, description="decode workers to start, 0 .. 64 (0: only those of other hosts)"
+        default=1,
+        ge=0,
+        le=64,
+        description="decode workers to start, 0 .. 64 (0: only those started by `fringed worker`)",
     )
 
 
