@@ -6,6 +6,7 @@ What each command does stands in `service.commands`; they import devices, arrays
 from __future__ import annotations
 
 import errno
+import inspect
 import os
 import sys
 import tempfile
@@ -62,6 +63,19 @@ app.command()(status.status)
 app.add_typer(simulate.group, name="simulate")
 
 
+def _list_whole_sentences(group: typer.Typer) -> None:
+    """A list of commands has the first paragraph of each one's help, where only its beginning would be shown."""
+    for command in group.registered_commands:
+        command.short_help = (inspect.getdoc(command.callback) or "").partition("\n\n")[0].replace("\n", " ")
+    for inner in group.registered_groups:
+        inner.short_help = None if inner.typer_instance is None else inner.typer_instance.info.help
+        if inner.typer_instance is not None:
+            _list_whole_sentences(inner.typer_instance)
+
+
+_list_whole_sentences(app)
+
+
 def run(words: list[str], *, debug: bool, as_json: bool) -> int:
     """Run one command and return its exit status. No traceback reaches the user, but for `debug`."""
     try:
@@ -101,7 +115,10 @@ def _run(words: list[str], as_json: bool) -> int:
         context = getattr(error, "ctx", None)
         path = context.command_path if context is not None else "fringed"
         message = error.format_message().removeprefix("Invalid value: ").replace("Value error, ", "")
-        print_error(message, f"{path} --help")
+        if message.startswith("Usage: "):  # a group without a command: its help is the whole answer
+            print(message, file=sys.stderr)
+        else:
+            print_error(message, f"{path} --help")
         if as_json:
             print_json({"error": {"code": WRONG_USAGE, "message": message, "class": "UsageError"}})
         return WRONG_USAGE

@@ -19,7 +19,9 @@ def status(
     ] = DEFAULT_ENDPOINT,
     as_json: AsJson = False,
 ) -> int:
-    """Ask a running daemon how it is: devices, workers, scans and disk. Scans without --connect have none that runs.
+    """Ask a running daemon how it is: devices, workers, scans and disk.
+
+    A scan without --connect has a daemon of its own, which ends with it and is not meant here.
 
     \b
     Examples:

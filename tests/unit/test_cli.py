@@ -86,6 +86,11 @@ def test_version_and_bare_call(run: Run) -> None:
     status, out, _ = run()
     assert status == 0
     assert "check-config" in out
+    assert "decoded as it comes. Ctrl-C ends it" in " ".join(out.split()), "the list cuts no sentence"
+    status, out, err = run("calibrate")
+    assert (status, out) == (2, "")
+    assert err.startswith("Usage: fringed calibrate")
+    assert "error" not in err.split("Commands:")[0]
 
 
 @pytest.mark.parametrize(
