@@ -71,6 +71,22 @@ def replacing(path: Path, digests: Digests | None = None, *, room: int = 0) -> I
         digests.begin(path.name, file.parts)
 
 
+def try_file(path: Path) -> None:
+    """Look whether `replace_file` will do, long before there is something to write. Leaves nothing.
+
+    Raises:
+        StorageError: it will not.
+    """
+    with storage_errors(path):
+        if path.is_dir():
+            raise StorageError(f"{path} is a folder, a file is to be written", hint="give another name")
+        if not path.parent.is_dir():
+            raise StorageError(f"{path} cannot be written: there is no folder {path.parent}", hint="make it first")
+        temporary = temporary_of(path)
+        temporary.touch()
+        temporary.unlink()
+
+
 def temporary_of(path: Path) -> Path:
     """Where the bytes of a file are until it is whole and takes its place."""
     return path.with_name(f".{path.name}.tmp")

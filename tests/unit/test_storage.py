@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from scanner.errors import StorageError
-from scanner.storage import try_output
+from scanner.storage import try_file, try_output
+from service import cli, private
 from service.commands.scan import INCOMING, Place
 
 
@@ -47,3 +48,44 @@ def test_without_a_name_a_folder_that_is_free_is_taken(tmp_path: Path, monkeypat
     place = Place(None, force=False)
     with place.made() as first, place.made() as second:
         assert first != second
+
+
+def test_a_file_is_tried_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "there.json").write_text("old")
+    try_file(tmp_path / "there.json")
+    try_file(tmp_path / "new.png")
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"there.json": "old"}
+    for refused, says in (
+        (tmp_path, "is a folder"),
+        (tmp_path / "none" / "x.png", "there is no folder"),
+        (tmp_path / "there.json" / "x.png", "there is no folder"),
+        (tmp_path / ("x" * 300), "too long"),
+        (Path("/proc/x.png"), "/proc/x.png"),
+    ):
+        with pytest.raises(StorageError, match=says):
+            try_file(refused)
+
+
+SCAN = ("nowhere",)
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (("preview", "--rig", "simulated:quick/board", "--seconds", "0"), "-o"),
+        (("live", "--rig", "simulated:quick/board", "--seconds", "1"), "--picture"),
+        (("calibrate", "solve", *SCAN, "--target", "chessboard:9x6:30"), "-o"),
+        (("calibrate", "marks", *SCAN, "--plate", "1,1,9,9"), "-o"),
+        (("calibrate", "mcp", *SCAN, *SCAN, "--calibration", "none.json"), "-o"),
+    ],
+)
+def test_an_unwritable_output_is_told_before_anything_is_opened(
+    words: tuple[str, ...],
+    option: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(private, "private_daemon", lambda _: pytest.fail("a daemon was started"))
+    assert cli.main([*words, option, str(tmp_path / "none" / "x.png")]) == 1
+    assert "there is no folder" in capsys.readouterr().err
