@@ -12,7 +12,7 @@ from scanner.calibration.grey_levels import LEVELS, response_of_levels
 from scanner.errors import CalibrationError
 from scanner.patterns.sequence import Precorrection
 from service.cli import main
-from service.scan_setup import inverse_table
+from service.rig_patterns import inverse_table
 
 SHAPE = (60, 80)
 
