@@ -80,7 +80,7 @@ def _coverage(canvas: Picture, guide: Guide, corner: tuple[int, int], scale: flo
 def _depths(canvas: Picture, guide: Guide, sight: Sight | str, box: tuple[int, int, int, int]) -> None:
     """A mark for each pose: depth against the first to the right, tilt upwards; the target seen now as a ring."""
     x, y, width, height = box
-    text(canvas, "depth of the first pose's, and tilt", (x, y - 10), size=17, colour=TEXT)
+    text(canvas, "tilt (up) over depth, to the first pose", (x, y - 10), size=17, colour=TEXT)
     cv2.rectangle(canvas, (x, y), (x + width, y + height), LINE, 1)
     standings = guide.standings
     now = sight.standing if isinstance(sight, Sight) else None
@@ -95,6 +95,9 @@ def _depths(canvas: Picture, guide: Guide, sight: Sight | str, box: tuple[int, i
 
     for share in (-0.075, 0.075):
         cv2.line(canvas, place(share, 0), place(share, 50), LINE, 1)
+    for tilt in (20, 30):  # what the advice asks for
+        cv2.line(canvas, place(-reach, tilt), place(reach, tilt), LINE, 1)
+        text(canvas, f"{tilt}°", (x + 4, place(0, tilt)[1] - 4), size=13, colour=DIM)
     for standing in standings:
         cv2.circle(canvas, place(standing.depth / first - 1, standing.tilt_deg), 4, ACCENT, -1, cv2.LINE_AA)
     if now is not None:
