@@ -42,6 +42,18 @@ def contracting_kernel(function: _F) -> _F:
     return cast(_F, numba.njit(cache=CACHED, nogil=True, error_model="numpy", fastmath=options)(function))
 
 
+def inlined_kernel(function: _F) -> _F:
+    """Compile `function` like `contracting_kernel`, into each kernel that calls it: its vectors stay in registers.
+
+    It must make no arrays: theirs to free are counted by nobody here.
+    """
+    options = {"contract", "nsz"}
+    compile_ = cast(Any, numba).njit(
+        cache=CACHED, nogil=True, error_model="numpy", fastmath=options, forceinline=True, _nrt=False
+    )
+    return cast(_F, compile_(function))
+
+
 def summing_kernel(function: _F) -> _F:
     """Compile `function` like `kernel`, free to take sums in any order: a dot product then runs in vector registers.
 

@@ -5,9 +5,9 @@ memory to the next loop. A kernel written in lanes says itself what is worked on
 and squares without leaving the registers. Where registers are narrower, more of them make one vector; the code and its
 results are the same.
 
-Lanes exist in compiled code only: floats (float32), whole numbers (int32) and masks. `+ - * /`, comparisons, `&` and
-`|` work lane by lane, with a scalar on either side as well; comparisons make masks, `choose` picks by them. Numba knows
-no such type by itself: this file teaches it one, by the rules of its extension interface.
+Lanes exist in compiled code only: floats (float32), whole numbers (int32), short ones (int16) and masks. `+ - * /`,
+comparisons, `&` and `|` work lane by lane, with a scalar on either side as well; comparisons make masks, `choose` picks
+by them. Numba knows no such type by itself: this file teaches it one, by the rules of its extension interface.
 """
 
 from __future__ import annotations
@@ -54,6 +54,7 @@ class _LanesType(types.Type):
 
 _FLOATS = _LanesType("float", ir.FloatType(), types.float32)
 _WHOLE = _LanesType("whole", ir.IntType(32), types.int32)
+_SHORT = _LanesType("short", ir.IntType(16), types.int16)
 _MASK = _LanesType("mask", ir.IntType(1), types.boolean)
 # Numba has no type hints.
 _extending, _compiler = cast(Any, extending), cast(Any, cgutils)
@@ -128,7 +129,7 @@ def greatest(a: Any, b: Any) -> Lanes:
     raise NotImplementedError("for kernels")
 
 
-_NUMBERS = {"float": _FLOATS, "whole": _WHOLE}
+_NUMBERS = {"float": _FLOATS, "whole": _WHOLE, "short": _SHORT}
 _TO_MASKS = dict.fromkeys(_NUMBERS, _MASK)
 for _plain, _in_place, _floating, _whole in (
     (operator.add, operator.iadd, "fadd", "add"),
@@ -214,22 +215,23 @@ with_sign: Callable[[Lanes, Lanes], Lanes] = _intrinsic(_copy_sign)
 """The magnitude of the first with the sign of the second."""
 
 
-def _converted(kind: _LanesType, other: _LanesType, convert: str) -> Callable[[Any], Lanes]:
+def _converted(kind: _LanesType, conversions: dict[str, str]) -> Callable[[Any], Lanes]:
     def one(context: Any, x: Any) -> Any:
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            if signature.args[0] is other:
-                return getattr(builder, convert)(values[0], kind.vector)
-            return _in_lanes(context, builder, values[0], signature.args[0], kind)
+            found = signature.args[0]
+            if isinstance(found, _LanesType):
+                return values[0] if found is kind else getattr(builder, conversions[found.kind])(values[0], kind.vector)
+            return _in_lanes(context, builder, values[0], found, kind)
 
         return kind(x), generate
 
     return cast(Callable[[Any], Lanes], _intrinsic(one))
 
 
-floats = _converted(_FLOATS, _WHOLE, "sitofp")
-"""Whole numbers, or a scalar for all lanes, as floats."""
-whole = _converted(_WHOLE, _FLOATS, "fptosi")
-"""Floats without their fraction, or a scalar for all lanes, as whole numbers."""
+floats = _converted(_FLOATS, {"whole": "sitofp", "short": "sitofp"})
+"""Whole or short numbers, or a scalar for all lanes, as floats."""
+whole = _converted(_WHOLE, {"float": "fptosi", "short": "sext"})
+"""Floats without their fraction, short numbers, or a scalar for all lanes, as whole numbers."""
 
 
 def _power_of_two(context: Any, exponent: Any) -> Any:
@@ -256,6 +258,18 @@ any_of: Callable[[Lanes], bool] = _intrinsic(_any_of)
 """Whether the mask is set anywhere."""
 
 
+def _all_of(context: Any, mask: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        bits = ir.IntType(LANES)
+        return builder.icmp_unsigned("==", builder.bitcast(values[0], bits), ir.Constant(bits, -1))
+
+    return (types.boolean(mask), generate) if mask is _MASK else None
+
+
+all_of: Callable[[Lanes], bool] = _intrinsic(_all_of)
+"""Whether the mask is set everywhere."""
+
+
 # --- memory -----------------------------------------------------------------------------------------------------------
 
 
@@ -264,22 +278,46 @@ def _pointer(context: Any, builder: Any, array: Any, value: Any, at: Any, vector
     return builder.bitcast(builder.gep(data, [at]), vector.as_pointer())
 
 
+def _address(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    """Where the frame's pixel lies, of (addresses, n, pixel, like)."""
+    table = context.make_array(signature.args[0])(context, builder, values[0]).data
+    bytes_each = ir.Constant(values[2].type, signature.args[3].dtype.bitwidth // 8)
+    return builder.add(builder.load(builder.gep(table, [values[1]])), builder.mul(values[2], bytes_each))
+
+
 def _samples(context: Any, addresses: Any, frame: Any, pixel: Any, like: Any) -> Any:
     bits = like.dtype.bitwidth
+    kind = _SHORT if bits == 8 else _WHOLE
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        table = context.make_array(signature.args[0])(context, builder, values[0]).data
-        first = builder.load(builder.gep(table, [values[1]]))
-        offset = builder.mul(values[2], ir.Constant(values[2].type, bits // 8))
         vector = ir.VectorType(ir.IntType(bits), LANES)
-        pointer = builder.inttoptr(builder.add(first, offset), vector.as_pointer())
-        return builder.zext(builder.load(pointer, align=bits // 8), _WHOLE.vector)
+        pointer = builder.inttoptr(_address(context, builder, signature, values), vector.as_pointer())
+        return builder.zext(builder.load(pointer, align=bits // 8), kind.vector)
 
-    return _WHOLE(addresses, types.intp, types.intp, like), generate
+    return kind(addresses, types.intp, types.intp, like), generate
 
 
 samples: Callable[[NDArray[Any], int, int, NDArray[Any]], Lanes] = _intrinsic(_samples)
-"""samples(addresses, n, pixel, like): grey levels of the n-th frame from a pixel on; see `scanner.decode.addresses`."""
+"""samples(addresses, n, pixel, like): grey levels of the n-th frame from a pixel on; see `scanner.decode.addresses`.
+
+Those of 8 bits are short numbers, of which 128 may be added up; all others whole numbers."""
+
+
+def _expect(context: Any, addresses: Any, frame: Any, pixel: Any, like: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        # llvm.prefetch(pointer, read, to the first-level cache, data); it never faults.
+        pointer, integer = _compiler.voidptr_t, ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [pointer, integer, integer, integer])
+        call = _compiler.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        options = [ir.Constant(integer, value) for value in (0, 3, 1)]
+        builder.call(call, [builder.inttoptr(_address(context, builder, signature, values), pointer), *options])
+        return context.get_dummy_value()
+
+    return types.void(addresses, types.intp, types.intp, like), generate
+
+
+expect: Callable[[NDArray[Any], int, int, NDArray[Any]], None] = _intrinsic(_expect)
+"""expect(addresses, n, pixel, like): have the processor fetch the cache line of that pixel, wherever it lies."""
 
 
 def _load(context: Any, array: Any, at: Any) -> Any:
@@ -300,7 +338,7 @@ def _store(context: Any, array: Any, at: Any, lanes: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         row, first, value = values
-        if lanes is _WHOLE and bits < 32:
+        if lanes is not _FLOATS and bits < lanes.scalar.bitwidth:
             value = builder.trunc(value, ir.VectorType(ir.IntType(bits), LANES))
         pointer = _pointer(context, builder, signature.args[0], row, first, value.type)
         builder.store(value, pointer, align=bits // 8)
@@ -310,4 +348,6 @@ def _store(context: Any, array: Any, at: Any, lanes: Any) -> Any:
 
 
 store: Callable[[NDArray[Any], int, Lanes], None] = _intrinsic(_store)
-"""store(row, at, lanes): floats into a (n,) float32 array, whole numbers into one of int32 or uint8. See `load`."""
+"""store(row, at, lanes): floats into a (n,) float32 array, whole or short numbers into one of as many bits, or uint8.
+
+See `load`."""

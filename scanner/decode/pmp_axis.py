@@ -18,7 +18,8 @@ from scanner.decode.agreement import MIN_PIXELS, Remainder
 from scanner.decode.neighbours import settle
 from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel
 from scanner.decode.pmp_frames import AxisFrames
-from scanner.decode.pmp_kernels import decode_pixels, join_maps
+from scanner.decode.pmp_join import join_maps
+from scanner.decode.pmp_kernels import decode_pixels
 from scanner.decode.pmp_light import Light, judge_light, judge_ripple
 from scanner.decode.pmp_sample import take_sample
 from scanner.decode.reasons import REASONS

@@ -1,9 +1,10 @@
-"""The pass of PMP decoding over pixels: all frames of one axis to coordinates, in one go and in cache.
+"""The pass of PMP decoding over pixels: all frames of one axis to coordinates, in one go and in registers.
 
 Frames are given by the addresses of their pixels, so that they may lie anywhere: in memory, or in the map of a file.
-Work goes through the image in tiles. A tile's samples are read once; sums, phases, fringe orders and the verdict follow
-while it is in the cache, in four loops over vectors of pixels (`scanner.lanes`): longer ones would wait for their own
-results. What a pixel's noise is, and how the ladder of beats climbs, is decided by the caller.
+Work goes through the image by vectors of pixels (`scanner.lanes`). A vector's samples are read once; sums, phases,
+fringe orders and the verdict follow, and only phases and modulations go through memory in between, a few cache lines.
+What no pixel of a vector needs is left out: a way up the ladder where nothing is lit, an exponential where no order is
+in doubt. What a pixel's noise is, and how the ladder of beats climbs, is decided by the caller.
 """
 
 from __future__ import annotations
@@ -13,16 +14,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.addresses import aligned_rows
-from scanner.decode.pmp_sums import TILE, fit_tile
+from scanner.decode.addresses import CACHE_LINE, aligned_rows
+from scanner.decode.pmp_sums import copies_of, fit_lanes, turns_of
 from scanner.decode.reasons import count_reasons
-from scanner.kernel import contracting_kernel
+from scanner.kernel import contracting_kernel, inlined_kernel
 from scanner.lanes import (
     LANES,
+    Lanes,
+    all_of,
     any_of,
     choose,
+    expect,
     floats,
     greatest,
+    least,
     load,
     magnitude,
     nearest,
@@ -47,6 +52,15 @@ _P3 = np.float32(np.log(2) ** 3 / 6)
 _P4 = np.float32(np.log(2) ** 4 / 24)
 _LOG2_E_HALF = np.float32(-0.5 * np.log2(np.e))
 _LEAST_POWER = np.float32(-120)
+
+_CERTAIN = np.float32(60)
+"""(1 - 2 |r|) / sigma^2 whose odds, e^-30, are nothing beside 1 in float32, for as many steps as there may be."""
+
+AHEAD = 1024
+"""Pixels between the one that is worked on and the one that is asked for: 2 us, several times what memory takes."""
+
+STRETCH = 16384
+"""Pixels whose reasons are counted together."""
 
 
 @contracting_kernel
@@ -98,41 +112,123 @@ def decode_pixels(
         limits: [modulation, modulation over its noise squared, residual variance over noise variance, residual
             variance over B^2, remainder over its sigma squared, wrong-order probability, edge in sigmas].
         periodic: both ends of the field look alike. finest: index of the finest set.
-        position, sigma, confidence, albedo, modulation: (P,) float32, written. reason: (P,) uint8, written.
+        position, sigma, confidence, albedo, modulation: (P,) float32, written; sigma, albedo and modulation may be
+            empty, and are left out then. reason: (P,) uint8, written.
         counts: (REASONS,) int64, how many pixels have each reason, is added to.
     """
     sets, steps = gains.size, ratios.size
-    # Behind the fit's rows: variance, lit sets, absolute phase, probability of a wrong order; then what the ladder
-    # combines of sets: a beat for each rung, an error for each step.
-    rows = aligned_rows(3 * sets + 7 + 2 * steps + 1, TILE)
-    fit, rest = rows[: 3 * sets + 3], rows[3 * sets + 3 : 3 * sets + 7]
-    first_beat, first_spread = 3 * sets + 7, 3 * sets + 8 + steps
-    beats, terms, parts = _plan(rungs, errors, gains, first_beat, first_spread, 2 * sets)
-    last = aligned_rows(5, TILE)
-    last_reason = np.empty(TILE, np.uint8)
-    for at in range(begin, end, TILE):
-        size = min(TILE, end - at)
-        blocks = -(-size // LANES) * LANES
-        fit_tile(addresses, like, starts, weights, grams, shifts, at, size, at + size < end, fit)
-        if _noise_of(fit, gains, noise, limits, blocks, rest[0], rest[1]):
-            _combine_rungs(rows, rungs, errors, gains, beats, terms, first_beat, first_spread, blocks)
-            _climb(rows.reshape(-1), beats, terms, parts, ratios, floors, scale[2], limits[4], blocks, rest)
-        if blocks == size:
-            _judge(
-                fit, rest, finest, gains, clip, noise, scale, limits, periodic, blocks,
-                position[at : at + size], sigma[at : at + size], confidence[at : at + size],
-                albedo[at : at + size], modulation[at : at + size], reason[at : at + size],
-            )  # fmt: skip
-        else:
-            _judge(
-                fit, rest, finest, gains, clip, noise, scale, limits, periodic, blocks,
-                last[0], last[1], last[2], last[3], last[4], last_reason,
-            )  # fmt: skip
-            position[at : at + size], sigma[at : at + size] = last[0, :size], last[1, :size]
-            confidence[at : at + size] = last[2, :size]
-            albedo[at : at + size], modulation[at : at + size] = last[3, :size], last[4, :size]
-            reason[at : at + size] = last_reason[:size]
-        count_reasons(reason[at : at + size], counts)
+    # Behind phases and B^2 by set: what the ladder combines of sets, a beat for each rung, a spread for each step.
+    spot = aligned_rows(2 * sets + 2 * steps + 1, LANES).reshape(-1)
+    beats, terms, parts = _plan(rungs, errors, gains)
+    turns = turns_of(starts, weights, shifts)
+    unit = _F1 / np.float32(clip) ** 2
+    line = CACHE_LINE // like.itemsize
+    solid = begin + (end - begin) // LANES * LANES
+    for at in range(begin, solid, LANES):
+        if at % line == 0:
+            for n in range(addresses.size):
+                expect(addresses, n, at + AHEAD, like)
+        _decode_lanes(
+            addresses, like, starts, weights, grams, shifts, turns, clip, gains, rungs, ratios, errors, floors, noise,
+            scale, limits, periodic, finest, beats, terms, parts, unit, spot, at, at,
+            position, sigma, confidence, albedo, modulation, reason,
+        )  # fmt: skip
+    if solid < end:
+        # What is left goes into vectors of its own: nothing may be read beyond a frame's last pixel.
+        size, spare, last_reason = end - solid, np.zeros((addresses.size, LANES), like.dtype), np.empty(LANES, np.uint8)
+        copies, last = copies_of(addresses, solid, size, like, spare), aligned_rows(5, LANES)
+        _decode_lanes(
+            copies, like, starts, weights, grams, shifts, turns, clip, gains, rungs, ratios, errors, floors, noise,
+            scale, limits, periodic, finest, beats, terms, parts, unit, spot, solid, 0,
+            last[0], last[1], last[2], last[3], last[4], last_reason,
+        )  # fmt: skip
+        position[solid:end], confidence[solid:end] = last[0, :size], last[2, :size]
+        reason[solid:end] = last_reason[:size]
+        if sigma.size > 0:
+            sigma[solid:end] = last[1, :size]
+            albedo[solid:end], modulation[solid:end] = last[3, :size], last[4, :size]
+    for at in range(begin, end, STRETCH):
+        count_reasons(reason[at : min(at + STRETCH, end)], counts)
+
+
+@inlined_kernel
+def _decode_lanes(
+    addresses: NDArray[np.intp],
+    like: NDArray[Any],
+    starts: NDArray[np.intp],
+    weights: NDArray[np.float32],
+    grams: NDArray[np.float32],
+    shifts: NDArray[np.intp],
+    turns: NDArray[np.float32],
+    clip: int,
+    gains: NDArray[np.float32],
+    rungs: NDArray[np.float32],
+    ratios: NDArray[np.float32],
+    errors: NDArray[np.float32],
+    floors: NDArray[np.float32],
+    noise: NDArray[np.float32],
+    scale: NDArray[np.float32],
+    limits: NDArray[np.float32],
+    periodic: bool,
+    finest: int,
+    beats: NDArray[np.intp],
+    terms: NDArray[np.intp],
+    parts: NDArray[np.float32],
+    unit: np.float32,
+    spot: NDArray[np.float32],
+    at: int,
+    to: int,
+    position: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    albedo: NDArray[np.float32],
+    modulation: NDArray[np.float32],
+    reason: NDArray[np.uint8],
+) -> None:
+    """Decode LANES pixels from `at` on, into the maps from `to` on."""
+    sets = gains.size
+    v0, slope, least_variance, prior, shrink = noise[0], noise[1], noise[2], noise[3], noise[4]
+    mean, residual, top = fit_lanes(addresses, like, starts, weights, grams, shifts, turns, at, spot)
+    model = greatest(v0 + slope * mean, least_variance)
+    # A residual can show a pixel to be noisier than the model has it; a small one is luck more often than not.
+    variance = greatest((prior * model + residual) * shrink, model)
+    lit, some = _lit(spot, gains, limits[0] * limits[0], limits[1], variance)
+    absolute, wrong = floats(_F0), floats(_F1)
+    if any_of(lit):
+        _combine(spot, rungs, errors, gains, beats, terms)
+        absolute, wrong = _climb(spot, beats, terms, parts, ratios, floors, scale[2], limits[4], unit, sets, variance)
+    along, origin, fine, low = scale[0], scale[1], scale[3], scale[4] + _HALF
+    cycles = absolute * (_F1 / fine)
+    if periodic:
+        # Both ends of a periodic field look alike: whole turns are taken off.
+        cycles -= nearest(cycles - low)
+    value = cycles * along - origin
+    square = load(spot, (sets + finest) * LANES)
+    spread = ((along / fine) ** 2 * gains[finest] * _PER_TURN2) * variance
+    # Farther from both ends than so many sigmas, without a root: squares that keep their sign.
+    edge = limits[6] if periodic else -limits[6]
+    room = least(value + _HALF, (along - _HALF) - value)
+    inside = (room * magnitude(room)) * square > (edge * abs(edge)) * spread
+    freedom = max(_F1 / shrink - prior, _F1)
+    still = (residual <= (limits[2] * freedom) * model) | (residual <= (limits[3] * freedom) * square)
+    good = inside & lit & still & (wrong <= limits[5]) & (top < clip)
+    known, why = good, whole(0)
+    if not all_of(good):
+        why = choose(inside, 0, 5)
+        why = choose(wrong <= limits[5], why, 4)
+        why = choose(lit, why, 3)
+        why = choose(some, why, 1)
+        why = choose(still, why, 7)
+        why = choose(top < clip, why, 2)
+        known = good | ((why > 3) & (why < 5))
+        value, wrong = choose(known, value, _NAN), choose(good, wrong, _F1)
+    store(position, to, value)
+    store(confidence, to, _F1 - wrong)
+    store(reason, to, why)
+    if sigma.size > 0:
+        store(sigma, to, choose(known, root(spread / square), _NAN))
+        store(albedo, to, mean)
+        store(modulation, to, root(square))
 
 
 # --- the ladder as rows -----------------------------------------------------------------------------------------------
@@ -143,18 +239,16 @@ def _plan(
     rungs: NDArray[np.float32],
     errors: NDArray[np.float32],
     gains: NDArray[np.float32],
-    first_beat: int,
-    first_spread: int,
-    inverses: int,
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
-    """Which rows the ladder climbs by: (J,) of each rung's phase; (J - 1, 2) of each step's errors, (J - 1, 2) weights.
+    """Which rows the ladder climbs by: (J,) of each rung's phase; (J - 1, 2) of each step's B^2, (J - 1, 2) weights.
 
     A rung that is one set is that set's phase, and an error of two sets is made up of theirs; others are combined in
-    rows of their own before.
+    rows of their own before, which lie behind those of the sets.
     """
     steps, sets = errors.shape
+    first_beat, first_spread = 2 * sets, 2 * sets + steps + 1
     beats = np.empty(steps + 1, np.intp)
-    terms = np.full((steps, 2), inverses)
+    terms = np.full((steps, 2), sets)
     parts = np.zeros((steps, 2), np.float32)
     for j in range(steps + 1):
         single = _only(rungs[j])
@@ -164,12 +258,11 @@ def _plan(
         for k in range(sets):
             if errors[j, k] != _F0:
                 if count < 2:
-                    terms[j, count] = inverses + k
+                    terms[j, count] = sets + k
                     parts[j, count] = errors[j, k] * gains[k] * _PER_TURN2
                 count += 1
         if count > 2:
-            terms[j, 0], parts[j, 0] = first_spread + j, _F1
-            terms[j, 1], parts[j, 1] = first_spread + j, _F0
+            terms[j, 0] = first_spread + j
     return beats, terms, parts
 
 
@@ -185,75 +278,51 @@ def _only(rung: NDArray[np.float32]) -> int:
     return only
 
 
-@contracting_kernel
-def _combine_rungs(
-    rows: NDArray[np.float32],
+@inlined_kernel
+def _combine(
+    spot: NDArray[np.float32],
     rungs: NDArray[np.float32],
     errors: NDArray[np.float32],
     gains: NDArray[np.float32],
     beats: NDArray[np.intp],
     terms: NDArray[np.intp],
-    first_beat: int,
-    first_spread: int,
-    size: int,
 ) -> None:
+    """Write the rows that are no set's own: phases of beats, and the sum of weight / B^2 of errors of three sets."""
     sets = gains.size
     for j in range(beats.size):
-        if beats[j] == first_beat + j:
-            _combine(rows[:sets], rungs[j], size, rows[beats[j]])
+        if beats[j] >= 2 * sets:
+            total = floats(_F0)
+            for k in range(sets):
+                total += rungs[j, k] * load(spot, k * LANES)
+            store(spot, beats[j] * LANES, total)
     for j in range(terms.shape[0]):
-        if terms[j, 0] == first_spread + j:
-            _combine(rows[2 * sets : 3 * sets], errors[j] * gains * _PER_TURN2, size, rows[terms[j, 0]])
+        if terms[j, 0] >= 2 * sets:
+            total = floats(_F0)
+            for k in range(sets):
+                total += errors[j, k] * gains[k] * _PER_TURN2 / load(spot, (sets + k) * LANES)
+            store(spot, terms[j, 0] * LANES, total)
 
 
-@contracting_kernel
-def _combine(values: NDArray[np.float32], weights: NDArray[np.float32], size: int, total: NDArray[np.float32]) -> None:
-    for i in range(0, size, LANES):
-        store(total, i, floats(_F0))
-    for k in range(weights.size):
-        weight, row = weights[k], values[k]
-        if weight != _F0:
-            for i in range(0, size, LANES):
-                store(total, i, load(total, i) + weight * load(row, i))
+@inlined_kernel
+def _lit(
+    spot: NDArray[np.float32], gains: NDArray[np.float32], min_b2: np.float32, min_sigmas2: np.float32, variance: Lanes
+) -> tuple[Lanes, Lanes]:
+    """Where all sets have enough modulation, and where any has."""
+    sets = gains.size
+    lit = load(spot, sets * LANES) >= greatest(min_sigmas2 * gains[0] * variance, min_b2)
+    some = lit
+    for k in range(1, sets):
+        enough = load(spot, (sets + k) * LANES) >= greatest(min_sigmas2 * gains[k] * variance, min_b2)
+        lit, some = lit & enough, some | enough
+    return lit, some
 
 
 # --- fringe orders ----------------------------------------------------------------------------------------------------
 
 
-@contracting_kernel
-def _noise_of(
-    fit: NDArray[np.float32],
-    gains: NDArray[np.float32],
-    noise: NDArray[np.float32],
-    limits: NDArray[np.float32],
-    size: int,
-    variance: NDArray[np.float32],
-    lit: NDArray[np.float32],
-) -> bool:
-    """Variance of a sample, and how many sets have enough modulation; whether any pixel has it in all of them."""
-    v0, slope, least, prior, shrink = noise[0], noise[1], noise[2], noise[3], noise[4]
-    sets = gains.size
-    mean, residual = fit[3 * sets], fit[3 * sets + 1]
-    for i in range(0, size, LANES):
-        model = greatest(v0 + slope * load(mean, i), least)
-        # A residual can show a pixel to be noisier than the model has it; a small one is luck more often than not.
-        store(variance, i, greatest((prior * model + load(residual, i)) * shrink, model))
-        store(lit, i, floats(_F0))
-    min_b2 = limits[0] * limits[0]
-    for k in range(sets):
-        squares, min_per_variance = fit[sets + k], limits[1] * gains[k]
-        for i in range(0, size, LANES):
-            enough = load(squares, i) >= greatest(min_per_variance * load(variance, i), min_b2)
-            store(lit, i, load(lit, i) + choose(enough, _F1, _F0))
-    all_lit, most = np.float32(sets) - _HALF, floats(_F0)
-    for i in range(0, size, LANES):
-        most = greatest(most, load(lit, i))
-    return any_of(most > all_lit)
-
-
-@contracting_kernel
+@inlined_kernel
 def _climb(
-    rows: NDArray[np.float32],
+    spot: NDArray[np.float32],
     beats: NDArray[np.intp],
     terms: NDArray[np.intp],
     parts: NDArray[np.float32],
@@ -261,140 +330,41 @@ def _climb(
     floors: NDArray[np.float32],
     centre: np.float32,
     max_remainder2: np.float32,
-    size: int,
-    rest: NDArray[np.float32],
-) -> None:
+    unit: np.float32,
+    sets: int,
+    variance: Lanes,
+) -> tuple[Lanes, Lanes]:
     """Up the ladder: the finest rung's absolute phase, and the probability that an order is wrong."""
-    variances, out, wrong = rest[0], rest[2], rest[3]
-    steps = ratios.size
-    count = np.float32(steps)
-    beats_at, terms_at = beats * TILE, terms * TILE
-    for i in range(0, size, LANES):
-        variance = load(variances, i)
-        absolute = load(rows, beats_at[0] + i)
-        absolute -= nearest(absolute - centre)
-        # The step that came nearest to the neighbouring order, and by what sigma; the worst remainder.
-        margin, spread, worst = floats(_HUGE), floats(_F1), floats(-_F1)
-        for j in range(steps):
-            own = parts[j, 0] * load(rows, terms_at[j, 0] + i) + parts[j, 1] * load(rows, terms_at[j, 1] + i)
-            error2 = variance * own + floors[j]
-            beat = load(rows, beats_at[j + 1] + i)
-            difference = ratios[j] * absolute - beat
-            order = nearest(difference)
-            remainder = difference - order
-            absolute = beat + order
-            room = _F1 - _F2 * magnitude(remainder)
-            # room / error2 < the least so far, without a division
-            nearer = room * spread < margin * error2
-            margin, spread = choose(nearer, room, margin), choose(nearer, error2, spread)
-            worst = greatest(worst, remainder * remainder - max_remainder2 * error2)
-        store(out, i, absolute)
-        # Odds of the neighbouring order against the nearest, for a normal error: exp(-(1 - 2 |r|) / (2 sigma^2)).
-        # The step in most danger stands for all.
+    absolute = load(spot, beats[0] * LANES)
+    absolute -= nearest(absolute - centre)
+    # The step that came nearest to the neighbouring order, and by what sigma; the worst remainder.
+    margin, spread, worst = floats(_HUGE), floats(_F1), floats(-_F1)
+    for j in range(ratios.size):
+        if terms[j, 0] < 2 * sets:
+            # a / B1^2 + b / B2^2 without the divisions: all that follows is times both.
+            one, two = unit * load(spot, terms[j, 0] * LANES), load(spot, terms[j, 1] * LANES)
+            weight = one * two
+            error2 = variance * (parts[j, 0] * unit * two + parts[j, 1] * one) + floors[j] * weight
+        else:
+            weight = floats(_F1)
+            error2 = variance * load(spot, terms[j, 0] * LANES) + floors[j]
+        beat = load(spot, beats[j + 1] * LANES)
+        difference = ratios[j] * absolute - beat
+        order = nearest(difference)
+        remainder = difference - order
+        absolute = beat + order
+        room = (_F1 - _F2 * magnitude(remainder)) * weight
+        # room / error2 < the least so far, without a division
+        nearer = room * spread < margin * error2
+        margin, spread = choose(nearer, room, margin), choose(nearer, error2, spread)
+        worst = greatest(worst, remainder * remainder * weight - max_remainder2 * error2)
+    # Odds of the neighbouring order against the nearest, for a normal error: exp(-(1 - 2 |r|) / (2 sigma^2)).
+    # The step in most danger stands for all.
+    wrong = floats(_F0)
+    if any_of(margin < _CERTAIN * spread):
         power = greatest(margin / spread * _LOG2_E_HALF, _LEAST_POWER)
         exponent = nearest(power)
         x = power - exponent
         odds = (_F1 + x * (_P1 + x * (_P2 + x * (_P3 + x * _P4)))) * power_of_two(whole(exponent))
-        store(wrong, i, choose(worst > _F0, _F1, count * odds))
-
-
-@contracting_kernel
-def _judge(
-    fit: NDArray[np.float32],
-    rest: NDArray[np.float32],
-    finest: int,
-    gains: NDArray[np.float32],
-    clip: int,
-    noise: NDArray[np.float32],
-    scale: NDArray[np.float32],
-    limits: NDArray[np.float32],
-    periodic: bool,
-    size: int,
-    position: NDArray[np.float32],
-    sigma: NDArray[np.float32],
-    confidence: NDArray[np.float32],
-    albedo: NDArray[np.float32],
-    modulation: NDArray[np.float32],
-    reason: NDArray[np.uint8],
-) -> None:
-    """Coordinate, sigma, confidence and reason of every pixel of a tile."""
-    sets = gains.size
-    squares, inverses = fit[sets + finest], fit[2 * sets + finest]
-    means, residuals, tops = fit[3 * sets], fit[3 * sets + 1], fit[3 * sets + 2]
-    variances, lits, absolutes, wrongs = rest[0], rest[1], rest[2], rest[3]
-    v0, slope, least = noise[0], noise[1], noise[2]
-    along, origin, fine, low = scale[0], scale[1], scale[3], scale[4] + _HALF
-    freedom = max(_F1 / noise[4] - noise[3], _F1)
-    max_excess, max_share, max_wrong = limits[2] * freedom, limits[3] * freedom, limits[5]
-    per_cycle, per_fringe2 = _F1 / fine, (along / fine) ** 2 * gains[finest] * _PER_TURN2
-    turn = _F1 if periodic else _F0
-    side = limits[6] if periodic else -limits[6]
-    all_lit, top = np.float32(sets) - _HALF, np.float32(clip)
-    beyond = along - _HALF
-    for i in range(0, size, LANES):
-        # Both ends of a periodic field look alike: whole turns are taken off.
-        turns = load(absolutes, i) * per_cycle
-        turns -= turn * nearest(turns - low)
-        value = turns * along - origin
-        deviation = root((per_fringe2 * load(variances, i)) * load(inverses, i))
-        wrong, lit, square = load(wrongs, i), load(lits, i), load(squares, i)
-        mean, residual = load(means, i), load(residuals, i)
-        edge = side * deviation - _HALF
-        inside = (value > edge) & (value + edge < beyond - _HALF)
-        model = greatest(v0 + slope * mean, least)
-        moved = (residual > max_excess * model) & (residual > max_share * square)
-        why = choose(inside, 0, 5)
-        why = choose(wrong > max_wrong, 4, why)
-        why = choose(lit > all_lit, why, 3)
-        why = choose(lit < _HALF, 1, why)
-        why = choose(moved, 7, why)
-        why = choose(load(tops, i) >= top, 2, why)
-        good = why < 1
-        known = good | ((why > 3) & (why < 5))
-        store(position, i, choose(known, value, _NAN))
-        store(sigma, i, choose(known, deviation, _NAN))
-        store(confidence, i, choose(good, _F1 - wrong, _F0))
-        store(reason, i, why)
-        store(albedo, i, mean)
-        store(modulation, i, root(square))
-
-
-# --- two axes ---------------------------------------------------------------------------------------------------------
-
-
-@contracting_kernel
-def join_maps(
-    position: NDArray[np.float32],
-    sigma: NDArray[np.float32],
-    confidence: NDArray[np.float32],
-    albedo: NDArray[np.float32],
-    modulation: NDArray[np.float32],
-    reason: NDArray[np.uint8],
-    other_position: NDArray[np.float32],
-    other_sigma: NDArray[np.float32],
-    other_confidence: NDArray[np.float32],
-    other_albedo: NDArray[np.float32],
-    other_modulation: NDArray[np.float32],
-    other_reason: NDArray[np.uint8],
-    counts: NDArray[np.int64],
-) -> None:
-    """A pixel is decided when both its coordinates are. All (P,); the first six become those of both axes.
-
-    Args:
-        counts: (REASONS,) int64, how many pixels have each reason, is added to.
-    """
-    for begin in range(0, reason.size, TILE):
-        end = min(begin + TILE, reason.size)
-        for i in range(begin, end):
-            why = reason[i] if reason[i] != 0 else other_reason[i]
-            reason[i] = why
-            confidence[i] *= other_confidence[i]
-            albedo[i] = _HALF * (albedo[i] + other_albedo[i])
-            modulation[i] = min(modulation[i], other_modulation[i])
-        for i in range(begin, end):
-            good = reason[i] == 0
-            position[i] = position[i] if good else _NAN
-            sigma[i] = sigma[i] if good else _NAN
-            other_position[i] = other_position[i] if good else _NAN
-            other_sigma[i] = other_sigma[i] if good else _NAN
-        count_reasons(reason[begin:end], counts)
+        wrong = np.float32(ratios.size) * odds
+    return absolute, choose(worst > _F0, _F1, wrong)

@@ -145,8 +145,8 @@ def _fit(frames: AxisFrames, runs: NDArray[np.intp], length: int, max_value: int
     mean, residual = (np.empty(runs.size * length, np.float32) for _ in range(2))
     clipped = np.empty(runs.size * length, np.bool_)
     fit_runs(
-        frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, frames.whole, clip, runs, length,
-        phases, modulations, mean, residual, clipped,
+        frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, frames.whole, clip,
+        frames.frames[0].size, runs, length, phases, modulations, mean, residual, clipped,
     )  # fmt: skip
     return Sample(
         phases.reshape(sets, *shape), modulations.reshape(sets, *shape), mean.reshape(shape), residual.reshape(shape),

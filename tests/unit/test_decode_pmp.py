@@ -11,8 +11,8 @@ import pytest
 from scanner.decode import Reason, decoder_for
 from scanner.decode.neighbours import CONFIDENCE, settle
 from scanner.decode.pmp import PmpDecoder, PmpThresholds, warm_up
-from scanner.decode.pmp_sums import ARCTAN_ERROR_CYCLES, TILE, _phase
-from scanner.decode.strips import in_strips
+from scanner.decode.pmp_sums import ARCTAN_ERROR_CYCLES, _phase
+from scanner.decode.strips import MIN_STRIP, in_strips
 from scanner.errors import DecodeError
 from scanner.kernel import contracting_kernel
 from scanner.lanes import LANES, load, store
@@ -468,12 +468,12 @@ def test_threads_and_borrowed_frames_make_no_difference(axes, size):
 
 
 def test_strips_cover_every_pixel_once():
-    for pixels, threads in ((1, 2), (TILE + 1, 2), (10 * TILE - 3, 3), (100_000, 1)):
+    for pixels, threads in ((1, 2), (MIN_STRIP + 1, 2), (10 * MIN_STRIP - 3, 3), (100_000, 1)):
         strips = sorted(in_strips(lambda begin, end: (begin, end), pixels, threads))
         assert strips[0][0] == 0
         assert strips[-1][1] == pixels
         assert all(before[1] == after[0] for before, after in pairwise(strips))
-        assert all(begin % TILE == 0 for begin, _ in strips)
+        assert all(begin % MIN_STRIP == 0 for begin, _ in strips)
 
 
 def test_the_arctangent_is_as_good_as_it_says():
@@ -498,4 +498,4 @@ def turns_of(p, q):
 @contracting_kernel
 def _turns_of(p, q, cycles):
     for i in range(0, p.size, LANES):
-        store(cycles, i, _phase(load(p, i), load(q, i), np.float32(1))[2])
+        store(cycles, i, _phase(load(p, i), load(q, i)))

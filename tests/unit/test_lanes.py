@@ -8,8 +8,10 @@ import pytest
 from scanner.kernel import kernel
 from scanner.lanes import (
     LANES,
+    all_of,
     any_of,
     choose,
+    expect,
     floats,
     greatest,
     least,
@@ -45,14 +47,14 @@ def calculate(a, b, out):
     total -= y
     total *= x
     store(out[9], 0, total)
-    return any_of(x < F(-100)), any_of(x < F(0))
+    return any_of(x < F(-100)), any_of(x < F(0)), all_of(x < F(0)), all_of(x < F(100))
 
 
 def test_floats_are_what_numpy_has():
     rng = np.random.default_rng(0)
     x, y = rng.normal(size=(2, LANES)).astype(F)
     out = np.zeros((10, LANES), F)
-    assert calculate(x, y, out) == (False, True)
+    assert calculate(x, y, out) == (False, True, False, True)
     expected = [
         x + y * 2 - 1 / x,
         np.minimum(x, y),
@@ -70,18 +72,20 @@ def test_floats_are_what_numpy_has():
 
 @kernel
 def grey_levels(addresses, like, out, codes):
+    expect(addresses, 0, 10**9, like)
     one, two = samples(addresses, 0, 3, like), samples(addresses, 1, 3, like)
     store(out[0], 0, floats(one - two))
     store(out[1], 0, floats(greatest(one, two) + least(one, 9)))
     store(codes, 0, choose(one < two, one, 255))
+    store(out[2], 0, floats(whole(one) * 300 - whole(two) * 300))
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_samples_are_whole_numbers_from_any_pixel_on(dtype):
     rng = np.random.default_rng(1)
     frames = rng.integers(0, np.iinfo(dtype).max, (2, LANES + 3), dtype, endpoint=True)
-    out, codes = np.zeros((2, LANES), F), np.zeros(LANES, np.uint8)
+    out, codes = np.zeros((3, LANES), F), np.zeros(LANES, np.uint8)
     grey_levels(np.array([frame.ctypes.data for frame in frames]), frames[0, :0], out, codes)
     one, two = frames[:, 3:].astype(int)
-    np.testing.assert_array_equal(out, [one - two, np.maximum(one, two) + np.minimum(one, 9)])
+    np.testing.assert_array_equal(out, [one - two, np.maximum(one, two) + np.minimum(one, 9), 300 * (one - two)])
     np.testing.assert_array_equal(codes, np.where(one < two, one, 255).astype(np.uint8))
