@@ -174,6 +174,10 @@ def _facts(found: LevelResponse | Response) -> list[tuple[str, str]]:
 def _where(of_projector: dict[str, Any] | None, written: Path | None) -> str:
     if written is not None:
         return f"written to {written}: scans with it are corrected from now on"
-    if of_projector is not None and "table" in of_projector:
-        return "--write FILE puts the table into a calibration file"
-    return 'calibration file: "response": {"projector": {"gamma": ...}}; what was undone already is in it'
+    if of_projector is None:
+        return (
+            "of no use to a calibration file: a table was undone. Measure the rig: fringed calibrate response RIG.toml"
+        )
+    if "table" in of_projector:
+        return "--write FILE puts the table into a calibration file, and scans undo it"
+    return "--write FILE puts the gamma (with what is undone already) into a calibration file, and scans undo it"

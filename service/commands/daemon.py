@@ -47,18 +47,23 @@ def worker(
 ) -> int:
     """Decode for a daemon, beside the workers it starts itself, until told to stop.
 
-    Its endpoint for workers is worker.ipc beside the one for clients.
+    Its endpoint for workers stands beside the one for clients: worker.ipc by control.ipc, NAME-worker.ipc by NAME.ipc.
 
     \b
     Examples:
       fringed worker --connect ipc:///run/fringed/worker.ipc
-      fringed worker --connect ipc:///tmp/worker.ipc       of a daemon at ipc:///tmp/try.ipc
+      fringed worker --connect ipc:///tmp/try-worker.ipc   of a daemon at ipc:///tmp/try.ipc
     """
+    from scanner.errors import Unreachable  # noqa: PLC0415
     from service.logs import start_logging  # noqa: PLC0415
     from service.worker import run_worker  # noqa: PLC0415
 
     start_logging("worker")
-    run_worker(connect)
+    try:
+        run_worker(connect)
+    except Unreachable as error:
+        error.hint = "of a daemon at ipc:///DIR/NAME.ipc give ipc:///DIR/NAME-worker.ipc; of control.ipc worker.ipc"
+        raise
     return 0
 
 
