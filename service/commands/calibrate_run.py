@@ -17,7 +17,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands.calibrate_solve import LENGTH_HELP, TARGET_HELP, length_given, report
+from service.commands.calibrate_solve import (
+    TARGET_HELP,
+    Baseline,
+    Distance,
+    Length,
+    Rigid,
+    WarmUp,
+    length_given,
+    report,
+)
 from service.commands.options import AsJson, Connect, output_path
 from service.terminal import progress_lines
 
@@ -61,32 +70,11 @@ def run(
         Path | None,
         typer.Option(metavar="FILE", parser=output_path, help="Live picture (png, jpg); else calibrate.png in DIR."),
     ] = None,
-    length: Annotated[
-        str | None,
-        typer.Option(
-            metavar="MM[:SIGMA]",
-            help=LENGTH_HELP,
-        ),
-    ] = None,
-    rigid: Annotated[
-        bool, typer.Option("--rigid", help="The target is glass or metal: no stretch and no bow are fitted.")
-    ] = False,
-    baseline: Annotated[
-        float | None,
-        typer.Option(
-            metavar="MM", min=1, max=1e5, help="Distance from lens to lens by a rule, mm: off by 15 % is refused."
-        ),
-    ] = None,
-    distance: Annotated[
-        float | None,
-        typer.Option(
-            metavar="MM", min=1, max=1e6, help="Distance of the targets by a rule, mm: off by 15 % is refused."
-        ),
-    ] = None,
-    warm_up: Annotated[
-        float | None,
-        typer.Option(metavar="MINUTES", min=0, max=1e5, help="How long the rig had been on, minutes; is recorded."),
-    ] = None,
+    length: Length = None,
+    rigid: Rigid = False,
+    baseline: Baseline = None,
+    distance: Distance = None,
+    warm_up: WarmUp = None,
     write: Annotated[
         bool, typer.Option("--write", help="Name the calibration in the rig file (a copy is kept beside it).")
     ] = False,

@@ -20,9 +20,6 @@ TARGET_HELP = (
     "chessboard:9x6:30 (inner corners, mm), charuco:10x7:30[:MARKER[:DICT]] (squares), circles:COLSxROWS:MM[:DIAM], "
     "acircles:COLSxROWS:MM[:DIAM], wedge:FILE."
 )
-LENGTH_HELP = (
-    "Measured length of the target's longest row of points, from the first to the last, mm, and its 1-sigma (else 0.1)."
-)
 
 
 class Model(StrEnum):
@@ -33,6 +30,31 @@ class Model(StrEnum):
 
 
 Replace = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
+Length = Annotated[
+    str | None,
+    typer.Option(
+        metavar="MM[:SIGMA]",
+        help="Measured length of the target's longest row of points, from the first to the last, mm, and its 1-sigma "
+        "(else 0.1).",
+    ),
+]
+Rigid = Annotated[bool, typer.Option("--rigid", help="The target is glass or metal: no stretch and no bow are fitted.")]
+Baseline = Annotated[
+    float | None,
+    typer.Option(
+        metavar="MM", min=1, max=1e5, help="Distance from lens to lens by a rule, mm: a result off by 15 % is refused."
+    ),
+]
+Distance = Annotated[
+    float | None,
+    typer.Option(
+        metavar="MM", min=1, max=1e6, help="Distance of the targets by a rule, mm: a result off by 15 % is refused."
+    ),
+]
+WarmUp = Annotated[
+    float | None,
+    typer.Option(metavar="MINUTES", min=0, max=1e5, help="How long the rig had been on, minutes; is recorded."),
+]
 
 
 def solve(
@@ -47,35 +69,11 @@ def solve(
         Model,
         typer.Option(metavar="pinhole|hall", help="Lenses with distortion, or the dissertation's 3 x 4 matrices."),
     ] = Model.PINHOLE,
-    length: Annotated[
-        str | None,
-        typer.Option(
-            metavar="MM[:SIGMA]",
-            help=LENGTH_HELP,
-        ),
-    ] = None,
-    rigid: Annotated[
-        bool, typer.Option("--rigid", help="The target is glass or metal: no stretch and no bow are fitted.")
-    ] = False,
-    baseline: Annotated[
-        float | None,
-        typer.Option(
-            metavar="MM",
-            min=1,
-            max=1e5,
-            help="Distance from lens to lens by a rule, mm: a result off by 15 % is refused.",
-        ),
-    ] = None,
-    distance: Annotated[
-        float | None,
-        typer.Option(
-            metavar="MM", min=1, max=1e6, help="Distance of the targets by a rule, mm: a result off by 15 % is refused."
-        ),
-    ] = None,
-    warm_up: Annotated[
-        float | None,
-        typer.Option(metavar="MINUTES", min=0, max=1e5, help="How long the rig had been on, minutes; is recorded."),
-    ] = None,
+    length: Length = None,
+    rigid: Rigid = False,
+    baseline: Baseline = None,
+    distance: Distance = None,
+    warm_up: WarmUp = None,
     picture: Annotated[
         bool, typer.Option("--picture/--no-picture", help="Draw residuals and coverage to FILE's name with .png.")
     ] = True,

@@ -12,6 +12,7 @@ from service.commands.decode_recording import decode_recording
 from service.commands.options import (
     AsJson,
     Box,
+    DecoderName,
     Depth,
     EdgeFilter,
     Force,
@@ -32,10 +33,7 @@ def decode(
         Path | None, typer.Option(metavar="FILE", help="Calibration to use instead of the capture's own.")
     ] = None,
     output: OutputFolder = None,
-    decoder: Annotated[
-        str,
-        typer.Option(metavar="NAME", help="Decoder, by name: default, or casey2011 (mcp as published, a yardstick)."),
-    ] = "default",
+    decoder: DecoderName = "default",
     stages: Annotated[
         Path | None,
         typer.Option(

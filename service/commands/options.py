@@ -36,6 +36,18 @@ Connect = Annotated[
     ),
 ]
 
+Exposure = Annotated[
+    str | None,
+    typer.Option(
+        metavar="auto|US",
+        help="Exposure: microseconds, or auto (test shots first). Default: the rig file's, else auto.",
+    ),
+]
+DecoderName = Annotated[
+    str,
+    typer.Option(metavar="NAME", help="Decoder, by name: default, or casey2011 (mcp as published, a yardstick)."),
+]
+
 
 class Method(StrEnum):
     """Methods that can be projected."""

@@ -21,8 +21,10 @@ from service.commands.options import (
     Box,
     Carriers,
     Connect,
+    DecoderName,
     Depth,
     EdgeFilter,
+    Exposure,
     Force,
     Frequencies,
     Levels,
@@ -63,13 +65,7 @@ def scan(
     ] = Method.PMP,
     output: OutputFolder = None,
     connect: Connect = None,
-    exposure: Annotated[
-        str | None,
-        typer.Option(
-            metavar="auto|US",
-            help="Exposure: microseconds, or auto (test shots first). Default: the rig file's, else auto.",
-        ),
-    ] = None,
+    exposure: Exposure = None,
     frequencies: Frequencies = None,
     shifts: Shifts = None,
     axis: AxisOption = None,
@@ -88,7 +84,7 @@ def scan(
     box: Box = None,
     min_confidence: MinConfidence = None,
     edge_filter: EdgeFilter = True,
-    decoder: Annotated[str, typer.Option(metavar="NAME", help="Decoder, by name.")] = "default",
+    decoder: DecoderName = "default",
     compare_truth: Annotated[
         bool, typer.Option("--compare-truth", help="Simulated rigs: compare with the truth, in the report and a map.")
     ] = False,
