@@ -2,7 +2,9 @@
 
 A decoded row is a curve in the projector's image once its lens distorts; the point sought lies on the camera's ray,
 so one unknown is left, the depth z. It starts from the closed form of the undistorted plane and Newton's method on
-the distorted projection makes it exact (Gauss-Newton where both axes were measured, weighted by their sigmas).
+the distorted projection makes it exact (Gauss-Newton where both axes were measured, weighted by their sigmas). Without
+distortion a row alone is Casey 2011, sec. 3.5; both axes minimise the reprojection error, as in Hartley and Sturm,
+"Triangulation", 1997, but in the projector alone: the camera's pixel is where it was asked.
 Nothing here filters for taste: only points that cannot be (behind a lens, not measured by what was projected) fall.
 """
 
