@@ -3,34 +3,41 @@
     python bench/after_last_frame.py [--method pmp] [--scene casey2011/bust] [--scans 5] [--folder DIR]
 
 Real processes on simulated devices, spool and scans in DIR (default: the temporary directory): daemon, devices process,
-worker. Times are CLOCK_MONOTONIC from the end of the last fringe frame's exposure, as frames.jsonl has it; the clocks
-of simulated devices run in real time. The client asks for scan.npz as soon as it is told of it, reads it from memory,
-and has the points when `xyz` and `confidence` are arrays. Files are complete when the scan is done. Beside it, in the
-same run: the bytes of scan.npz and cloud.ply written raw to the same folder, with the same fsync. The worker's own
-stages come from the report. Medians; the first scan is not counted.
+worker. Times are CLOCK_MONOTONIC from the end of the last frame's exposure, as frames.jsonl has it; the clocks of
+simulated devices run in real time. The client asks for the points when it is told that they are there, and has them
+when `xyz` and `confidence` are arrays. The worker's own stages come from the report; the check of the frames runs
+beside the stages from decoding to filtering. Medians, least and most; the first scan is not counted.
+
+Then the files by themselves, in this process: the last scan saved again and again, in turn with the same bytes written
+raw to the same folder with the same fsync, in DIR and in memory (/dev/shm, where no disk plays a part). Ratios are of
+neighbours in time, since disks change their pace.
 """
 
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scanner.client import Client
+from scanner.scan import Scan, load_scan
 from service.config import RigConfig
 
 PIECE = 4 << 20
+FILES = 9
+"""Times that the files are saved"""
 
 
 def main() -> None:
@@ -46,25 +53,35 @@ def main() -> None:
         tempfile.TemporaryDirectory(prefix="fringed-bench-", dir=given.folder) as name,
         daemon_with_worker(Path(name), given.scene) as client,
     ):
-        for _ in range(given.scans + 1):
-            rows.append(one_scan(client, given.method, Path(name)))
+        for number in range(given.scans + 1):
+            rows.append(one_scan(client, given.method, Path(name) / "last" if number == given.scans else None))
+        scan = load_scan(Path(name) / "last")
+        files = [files_and_raw(scan, Path(name) / "files") for _ in range(1 + FILES)][1:]
+    show(rows[1:])
+    with tempfile.TemporaryDirectory(prefix="fringed-bench-", dir="/dev/shm") as memory:
+        in_memory = [files_and_raw(scan, Path(memory)) for _ in range(1 + FILES)][1:]
+    for where, found in (("on the disk", files), ("in memory", in_memory)):
+        print(f"scan.npz and cloud.ply, {where}")
+        show(found)
+
+
+def show(rows: list[dict[str, float]]) -> None:
+    """Print medians, and from where to where the values go."""
     for key in dict.fromkeys(key for row in rows for key in row):
-        values = [row[key] for row in rows[1:] if key in row]
-        print(f"{key:44s}{np.median(values):9.1f} ({min(values):.1f})")
+        values = [row[key] for row in rows if key in row]
+        print(f"{key:44s}{np.median(values):9.2f} ({min(values):.2f} to {max(values):.2f})")
 
 
-def one_scan(client: Client, method: str, folder: Path) -> dict[str, float]:
-    """Milliseconds by what they are of, of one scan, which is deleted afterwards."""
+def one_scan(client: Client, method: str, folder: Path | None) -> dict[str, float]:
+    """Milliseconds by what they are of, of one scan, which is deleted afterwards; its files go to `folder`."""
     job = client.start_scan(method)
     told: dict[str, int] = {}
     for event in client.events(job, patience_s=120):
         told.setdefault(event.kind, time.monotonic_ns())
-        if event.kind == "decoded":
-            size = next(entry["bytes"] for entry in event.fields["files"] if entry["name"] == "scan.npz")
-            with np.load(io.BytesIO(fetched(client, job, size))) as content:
-                points, confidence = content["xyz"], content["confidence"]
-            told["points"] = time.monotonic_ns()
-            assert points.shape[:2] == confidence.shape
+        if event.kind == "points":
+            arrays = client.arrays(event)
+            told["here"] = time.monotonic_ns()
+            assert arrays["xyz"].shape[:2] == arrays["confidence"].shape
     outcome = client.result(job)
     assert outcome["state"] == "done", outcome["error"]
     sizes = {entry["name"]: entry["bytes"] for entry in outcome["files"]}
@@ -73,14 +90,15 @@ def one_scan(client: Client, method: str, folder: Path) -> dict[str, float]:
     end_ns = max(r["exposure"]["end_ns"] for r in map(json.loads, lines) if r["status"] == "ok")
     last = {name: (at - end_ns) / 1e6 for name, at in told.items()}
     found = {
-        "told that it is decoded": last["decoded"],
-        "XYZ and confidence in the client's memory": last["points"],
+        "told that the capture is on the disk": last["acquired"],
+        "told that the points are there": last["points"],
+        "XYZ and confidence in the client's memory": last["here"],
+        "told that scan.npz is whole": last["decoded"],
         "told that all is done": last["done"],
     }
     found |= {f"  worker: {stage}": 1e3 * seconds for stage, seconds in report["timings"].items()}
-    files = sum(report["timings"].get(f"write {name}", 0.0) for name in ("scan.npz", "cloud.ply"))
-    own = raw(folder / "raw", sizes["scan.npz"]) + raw(folder / "raw", sizes["cloud.ply"])
-    found |= {"scan.npz and cloud.ply": 1e3 * files, "the same bytes raw": 1e3 * own, "  ratio": files / own}
+    if folder is not None:
+        client.fetch(job, folder)
     client.delete(job)
     return found
 
@@ -94,15 +112,37 @@ def fetched(client: Client, job: str, size: int, name: str = "scan.npz") -> byte
     return b"".join(pieces)
 
 
-def raw(path: Path, size: int) -> float:
-    """Seconds to write so many bytes."""
-    content = np.random.default_rng(0).bytes(size)
+def files_and_raw(scan: Scan, folder: Path) -> dict[str, float]:
+    """Milliseconds until both files are whole in a folder, and until their bytes are written raw; nothing stays."""
+    told: dict[str, float] = {}
+    fresh = replace(scan, report={})  # with no normals made yet
+    shutil.rmtree(folder / "scan", ignore_errors=True)
     began = time.perf_counter()
-    with path.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    return time.perf_counter() - began
+
+    def whole(name: str) -> None:
+        told[name] = time.perf_counter() - began
+        if name == "cloud.ply":
+            raise _BothThereError
+
+    with suppress(_BothThereError):
+        fresh.save(folder / "scan", whole)
+    contents = [(folder / "scan" / name).read_bytes() for name in told]
+    began = time.perf_counter()
+    for name, content in zip(told, contents, strict=True):
+        with (folder / "scan" / f"raw-{name}").open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+    raw = time.perf_counter() - began
+    return {
+        "  both whole": 1e3 * told["cloud.ply"],
+        "  the same bytes raw": 1e3 * raw,
+        "  ratio": told["cloud.ply"] / raw,
+    }
+
+
+class _BothThereError(Exception):
+    """Ends a save whose picture and report are not waited for."""
 
 
 @contextmanager

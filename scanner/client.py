@@ -42,6 +42,8 @@ from scanner.session import (
 from scanner.wire import DEFAULT_ENDPOINT, WELCOME, Event
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from scanner.camera_picture import CameraPicture
     from scanner.live import LiveFrame
     from scanner.scan import Scan
@@ -171,6 +173,12 @@ class Client:
     ) -> Path:
         """Bring all files of a scan into `folder`, checked, and acknowledge it; see `scanner.session.fetch`."""
         return self._run(fetch(job_id, folder, on_progress, failed_too=failed_too))
+
+    def arrays(self, points: Event) -> dict[str, NDArray[Any]]:
+        """xyz and confidence of a scan whose files are still being written: of its event `points` (see `events`)."""
+        from scanner.early_points import fetch_arrays  # noqa: PLC0415  (clients that want no arrays do not load them)
+
+        return self._run(fetch_arrays(points))
 
     def cancel(self, job_id: str) -> dict[str, Any]:
         """Stop a job; returns its state. A job that is over stays as it is."""

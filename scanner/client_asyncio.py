@@ -34,6 +34,8 @@ from scanner.session import (
 from scanner.wire import DEFAULT_ENDPOINT, Event
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from scanner.live import LiveFrame
     from scanner.scan import Scan
 
@@ -157,6 +159,12 @@ class AsyncClient:
     ) -> Path:
         """Bring all files of a scan into `folder`, checked, and acknowledge it."""
         return await self._run(fetch(job_id, folder, on_progress, failed_too=failed_too))
+
+    async def arrays(self, points: Event) -> dict[str, NDArray[Any]]:
+        """xyz and confidence of a scan whose files are still being written; see `Client.arrays`."""
+        from scanner.early_points import fetch_arrays  # noqa: PLC0415
+
+        return await self._run(fetch_arrays(points))
 
     async def cancel(self, job_id: str) -> dict[str, Any]:
         """Stop a job; returns its state."""

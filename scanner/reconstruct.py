@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -21,24 +22,28 @@ from scanner.capture.exposure import exposure_report, exposure_warnings
 from scanner.carrier_check import require_carriers
 from scanner.compare import compare
 from scanner.contrast import widen_at_edges
-from scanner.decode import Decoded, Decoder, KeepingDecoder, Reason, decoder_for
+from scanner.decode import Decoded, Decoder, KeepingDecoder, decoder_for
 from scanner.decode.repeated import Repetitions
 from scanner.decode.stages import Observer
 from scanner.devices import Pixels, Truth
+from scanner.empty_scan import raise_if_empty
 from scanner.errors import CalibrationError, DecodeError
 from scanner.filter_settings import FilterSettings
 from scanner.geometry import Calibration, load_calibration
 from scanner.patterns import GrayPattern, GrayPmpPattern, McpPattern, PatternSequence, PmpPattern
 from scanner.ripple_correction import without_ripple
 from scanner.scale_check import require_codes_within, require_geometry
-from scanner.scan import Scan, build_scan
-from scanner.sequencer import check_capture
+from scanner.scan import Map, Scan, build_scan
+from scanner.sequencer import CaptureCheck, check_capture
 from scanner.uncertainty import budget_of
 
 TRUTH_FILE = "truth.npz"
 
 Progress = Callable[[str], None]
 """Told the name of each stage as it begins."""
+
+OnPoints = Callable[[Map, Map], None]
+"""Takes xyz (H, W, 3) and confidence (H, W), both float32 and final."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +136,14 @@ class Reconstruction:
         if self._header.repeat > 1 and self._is_whole(repetition):
             self._end_repetition(repetition)
 
-    def finish(self, capture: Capture, progress: Progress | None = None) -> Scan:
-        """The scan, once the folder is closed (or interrupted).
+    def finish(self, capture: Capture, progress: Progress | None = None, points: OnPoints | None = None) -> Scan:
+        """The scan, once all frames are there; the folder may still be open.
+
+        Args:
+            capture: the folder.
+            progress: told each stage.
+            points: takes xyz and confidence as soon as they are sure, where there is a calibration: sigmas and report
+                are still to come.
 
         Raises:
             SyncError: the frames are out of step.
@@ -141,10 +152,38 @@ class Reconstruction:
         """
         tell = progress or (lambda _: None)
         tell("checking frames")
-        with self._timed("check"):
-            check = check_capture(capture)
-            check.raise_if_out_of_step()
         self._catch_up(capture)
+        with ThreadPoolExecutor(1, thread_name_prefix="check") as beside:
+            checking = beside.submit(self._checked, capture)
+            try:
+                scan = self._solved(capture, tell, checking, points)
+            except Exception:
+                checking.result()  # frames out of step say more than what comes of them
+                raise
+            check = checking.result()
+        if isinstance(self._header.sequence.pattern, PmpPattern | GrayPmpPattern):
+            with self._timed("widen sigmas"):
+                scan = widen_at_edges(scan, "y" if self._calibration is None else self._calibration.phase_axis)
+        scan = scan.with_report(
+            sync=check.as_dict(),
+            capture=self.capture_report(capture),
+            uncertainty=self._budget(scan, check.mixed_share),
+        )
+        with self._timed("drift and marks"):
+            scan = watched(scan, self._calibration, self._header)
+        if self._options.compare_truth:
+            tell("comparing with truth")
+            scan = self._compared(scan, capture)
+        return scan
+
+    def _checked(self, capture: Capture) -> CaptureCheck:
+        with self._timed("check"):
+            return check_capture(capture).raise_if_out_of_step()
+
+    def _solved(
+        self, capture: Capture, tell: Progress, checking: Future[CaptureCheck], points: OnPoints | None
+    ) -> Scan:
+        """Maps and points; `points` is told when the frames are checked, too."""
         tell("decoding")
         decoded = self._decoded()
         require_codes_within(decoded, self._header.sequence)
@@ -155,21 +194,13 @@ class Reconstruction:
             decoded = without_ripple(decoded, self._header.sequence)
         decoded = self._carriers_fit(self._fits_geometry(decoded), capture)
         tell("triangulating")
-        scan = build_scan(decoded, self._calibration, self._options.filters, timings=self._timings)
-        if isinstance(self._header.sequence.pattern, PmpPattern | GrayPmpPattern):
-            with self._timed("widen sigmas"):
-                scan = widen_at_edges(scan, "y" if self._calibration is None else self._calibration.phase_axis)
-        scan = scan.with_report(
-            sync=check.as_dict(),
-            capture=self._capture_report(capture),
-            uncertainty=self._budget(scan, check.mixed_share),
-        )
-        with self._timed("drift and marks"):
-            scan = watched(scan, self._calibration, self._header)
-        if self._options.compare_truth:
-            tell("comparing with truth")
-            scan = self._compared(scan, capture)
-        return scan
+
+        def sure(xyz: Map) -> None:
+            checking.result()
+            if points is not None:
+                points(xyz, decoded.confidence)
+
+        return build_scan(decoded, self._calibration, self._options.filters, timings=self._timings, points=sure)
 
     def _is_whole(self, repetition: int) -> bool:
         count = len(self._header.sequence)
@@ -240,7 +271,8 @@ class Reconstruction:
     def _new_decoder(self, observer: Observer | None = None) -> Decoder:
         return decoder_for(self._header.sequence, self._header.camera, self._options.decoder, observer)
 
-    def _capture_report(self, capture: Capture) -> dict[str, Any]:
+    def capture_report(self, capture: Capture) -> dict[str, Any]:
+        """The report's `capture`: made anew where the folder was closed since."""
         header = capture.header
         return {
             "id": header.id,
@@ -302,46 +334,6 @@ def require_sizes(header: CaptureHeader, calibration: Calibration) -> None:
                 f"the capture is of one of {here[0]} x {here[1]}",
                 hint=f"use the calibration {hint}",
             )
-
-
-_IN_WORDS = {
-    Reason.SHADOW: "in shadow",
-    Reason.CLIPPED: "clipped",
-    Reason.LOW_MODULATION: "of too little modulation",
-    Reason.UNWRAP_RISK: "of no certain fringe or stripe",
-    Reason.BORDER: "on borders of cells or stripes",
-    Reason.OUT_OF_STEP: "out of step",
-    Reason.MOVED: "moved",
-    Reason.FILTERED: "filtered",
-}
-_REMEDIES = {
-    Reason.SHADOW: "raise the exposure, open the lens or move nearer",
-    Reason.CLIPPED: "lower the exposure or the gain, or close the lens",
-    Reason.LOW_MODULATION: "raise the exposure, focus projector and camera, or take lower frequencies",
-    Reason.UNWRAP_RISK: "look at the order of the frames (fringed audit), correct the projector's gamma "
-    "(precorrection), or take fewer or denser frequencies",
-    Reason.BORDER: "focus projector and camera, or take fewer bits",
-}
-
-
-def raise_if_empty(decoded: Decoded) -> None:
-    """Raise where no pixel at all has a value: an empty cloud is no success.
-
-    Raises:
-        DecodeError: with the reasons that dominate, and what to do about the first of them.
-    """
-    counts = np.bincount(decoded.reason.reshape(-1), minlength=len(Reason))
-    if counts[Reason.VALUE] or not counts.any():
-        return
-    lit = counts.copy()
-    lit[Reason.SHADOW] = 0
-    order = [Reason(int(i)) for i in np.argsort(-lit if lit.any() else -counts, kind="stable")]
-    first = order[0]
-    named = ", ".join(f"{counts[r]:,} {_IN_WORDS[r]}" for r in sorted(_IN_WORDS, key=lambda r: -counts[r]) if counts[r])
-    raise DecodeError(
-        f"no pixel could be decoded although the scene is lit: of {int(counts.sum()):,} pixels {named}",
-        hint=_REMEDIES.get(first, "look at the order of the frames with fringed audit, and capture again"),
-    )
 
 
 def ambiguity_px(sequence: PatternSequence) -> float | None:

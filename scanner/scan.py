@@ -7,7 +7,7 @@ formats.md (scan.npz, cloud.ply, preview.png, report.json). Pictures are drawn i
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -136,6 +136,7 @@ def build_scan(
     filters: FilterSettings | None = None,
     *,
     timings: dict[str, float] | None = None,
+    points: Callable[[Map], None] | None = None,
 ) -> Scan:
     """Triangulate and filter decoded maps.
 
@@ -144,6 +145,7 @@ def build_scan(
         calibration: the rig; None gives a scan without points.
         filters: None = `FilterSettings()`.
         timings: seconds by stage so far; this function's stages are added, and the report gets them all.
+        points: takes xyz as soon as it is final, before the report is made; not without a calibration.
 
     Raises:
         CalibrationError: see `scanner.triangulation.triangulate`.
@@ -154,8 +156,10 @@ def build_scan(
     reason = decoded.reason
     removed: dict[str, int] = {}
     if calibration is not None:
-        points = filtered_points(decoded, calibration, settings, timings=timings)
-        xyz, sigma_z, reason, removed = points.xyz, points.sigma_z, points.reason, points.removed
+        found = filtered_points(decoded, calibration, settings, timings=timings)
+        xyz, sigma_z, reason, removed = found.xyz, found.sigma_z, found.reason, found.removed
+        if points is not None:
+            points(xyz)
     scan = Scan(
         **{name: getattr(decoded, name) for name in _MAPS if name != "sigma_z"},
         reason=reason,

@@ -48,6 +48,7 @@ class ArrayPlace:
     dtype: str
     shape: tuple[int, ...]
     offset: int
+    bytes: int
 
 
 class ScanWriter:
@@ -130,7 +131,7 @@ class ScanWriter:
 
     def _add(self, npz: NpzWriter, name: str, array: NDArray[Any]) -> ArrayPlace:
         self._there[name] = array
-        return ArrayPlace(name, array.dtype.str, array.shape, npz.add(name, array))
+        return ArrayPlace(name, array.dtype.str, array.shape, npz.add(name, array), array.nbytes)
 
     def _write_arrays(self, scan: Scan) -> None:
         arrays = scan.arrays()
@@ -139,7 +140,7 @@ class ScanWriter:
             for name, array in arrays.items():
                 if name not in self._there:
                     self._add(npz, name, array)
-                elif self._there[name] is not array:
+                elif not np.shares_memory(self._there[name], array):
                     raise AssertionError(f"{name} was written before it was what it is")
             npz.close()
             self._open.close()

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import msgspec
 from msgspec import Struct
 
-from scanner.wire import ErrorBody, FileEntry, decoded
+from scanner.wire import ArrayEntry, ErrorBody, FileEntry, decoded
 
 EndReason = Literal[
     "completed",
@@ -67,6 +67,13 @@ class Progress(Struct, frozen=True, tag="progress"):
 
     delivery: int
     stage: str
+
+
+class PointsNote(Struct, frozen=True, tag="points"):
+    """Worker: these arrays of scan.npz are there to be read, before the file is whole."""
+
+    delivery: int
+    arrays: list[ArrayEntry]
 
 
 class DecodedNote(Struct, frozen=True, tag="decoded"):
@@ -207,7 +214,9 @@ class Stop(Struct, frozen=True, tag="stop"):
     """Daemon: finish and exit."""
 
 
-FromWorker = Ready | Alive | Ack | Progress | DecodedNote | Result | LiveCounts | Failed | Released | Leaving
+FromWorker = (
+    Ready | Alive | Ack | Progress | PointsNote | DecodedNote | Result | LiveCounts | Failed | Released | Leaving
+)
 ToWorker = Start | Frame | End | LiveBegin | LiveFrame | Cancel | Identify | Stop
 
 _from_worker: msgspec.msgpack.Decoder[FromWorker] = msgspec.msgpack.Decoder(FromWorker)

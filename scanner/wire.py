@@ -197,6 +197,17 @@ class PreviewStart(Struct, frozen=True, forbid_unknown_fields=True):
     max_width: int = 480
 
 
+class ArrayEntry(Struct, frozen=True):
+    """An array in scan.npz: C-contiguous from byte `offset` on."""
+
+    name: str
+    dtype: str
+    """as NumPy writes it: <f4"""
+    shape: tuple[int, ...]
+    offset: int
+    bytes: int
+
+
 class FileEntry(Struct, frozen=True):
     """One file of a scan."""
 

@@ -27,6 +27,7 @@ from scanner.stream import (
     LiveBegin,
     LiveCounts,
     LiveFrame,
+    PointsNote,
     Progress,
     Ready,
     Released,
@@ -36,6 +37,7 @@ from scanner.stream import (
 )
 from scanner.wire import (
     PROTOCOL,
+    ArrayEntry,
     Event,
     FileEntry,
     Notification,
@@ -53,6 +55,10 @@ SHA = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
 BEGIN, END = "<!-- examples: begin -->", "<!-- examples: end -->"
 
 _FILE = FileEntry("scan.npz", 2843430, SHA)
+_ARRAYS = (
+    ArrayEntry("xyz", "<f4", (240, 320, 3), 165, 921600),
+    ArrayEntry("confidence", "<f4", (240, 320), 922092, 307200),
+)
 
 LIVE_JOB = "5d0e2f7c-7c1a-4b0e-9a53-0a4f5f7f1d22"
 
@@ -233,6 +239,12 @@ EVENTS: tuple[Event, ...] = (
     Event(44, "frame", JOB, {"state": "acquiring", "captured": 11, "total": 31, "retakes": 0}),
     Event(97, "live.counts", LIVE_JOB, {"state": "acquiring", "captured": 690, "decoded": 681, "dropped": 7}),
     Event(60, "decoding", JOB, {"state": "decoding", "stage": "triangulating"}),
+    Event(
+        62,
+        "points",
+        JOB,
+        {"state": "decoding", "file": "scan.npz", "arrays": [msgspec.to_builtins(array) for array in _ARRAYS]},
+    ),
     Event(61, "worker.lost", None, {"worker": "rig-812", "why": "ended with status -9"}),
 )
 
@@ -264,6 +276,7 @@ STREAM: tuple[Struct, ...] = (
     Ack(DELIVERY, 4),
     End(DELIVERY, "completed", 31, []),
     Progress(DELIVERY, "triangulating"),
+    PointsNote(DELIVERY, list(_ARRAYS)),
     DecodedNote(DELIVERY, [_FILE], {"points": 76800}),
     LiveBegin(DELIVERY, LIVE_JOB, {"format": "fringed-capture"}, None, "ipc:///run/fringed/live.ipc", 0),
     LiveFrame(
@@ -323,7 +336,7 @@ def vectors() -> list[dict[str, str | Any]]:
             "hex": encode_image(live, rows).hex(),
         }
     )
-    to_daemon = (Ready, Ack, Progress, DecodedNote, LiveCounts, Result, Failed, Released, Alive, Leaving)
+    to_daemon = (Ready, Ack, Progress, PointsNote, DecodedNote, LiveCounts, Result, Failed, Released, Alive, Leaving)
     for message in STREAM:
         direction = "worker to daemon" if isinstance(message, to_daemon) else "daemon to worker"
         found.append(_vector(f"worker: {message.__struct_config__.tag}", direction, message))

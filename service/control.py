@@ -7,12 +7,14 @@ import logging
 import os
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from scanner.errors import DeviceBusy, ScannerError, StorageError
+from scanner.storage import temporary_of
 from scanner.wire import (
     MAX_FETCH_BYTES,
     MAX_MESSAGE_BYTES,
@@ -247,8 +249,8 @@ class Control:
     async def _fetch(self, request: Request, _client: str) -> bytes:
         given = params_as(Fetch, request)
         job = self._pipeline.store.get(given.id)
-        entry = next((entry for entry in job.files if entry.name == given.name), None)
-        if entry is None or job.deleted:
+        size = None if job.deleted else job.readable(given.name)
+        if size is None:
             raise Refused(
                 f"job {job.id} has no file {given.name[:200]!r}", reason="unknown_file", hint="scan.result names them"
             )
@@ -258,13 +260,14 @@ class Control:
                 reason="invalid_params",
                 hint=f"offset 0 or more, length 1 .. {MAX_FETCH_BYTES}",
             )
-        if given.offset >= entry.bytes:
+        length = min(given.length, size - given.offset)
+        if length <= 0:
             return b""  # also where the file system could not seek so far
         self._pipeline.spool.lease(job.id)
         folder = self._pipeline.spool.folder(job.id)
-        inside, _, name = entry.name.rpartition("/")
+        inside, _, name = given.name.rpartition("/")
         path = (folder / inside if inside else folder / (job.output or "")) / name
-        return await asyncio.to_thread(_piece, path, given.offset, given.length)
+        return await asyncio.to_thread(_piece, path, given.offset, length)
 
     async def _cancel(self, request: Request, _client: str) -> dict[str, Any]:
         job = self._job(request)
@@ -350,10 +353,17 @@ def _only_part(body: list[bytes]) -> bytes:
 
 def _piece(path: Path, offset: int, length: int) -> bytes:
     try:
-        with path.open("rb", buffering=0) as file:
-            file.seek(offset)
-            return file.read(length)
+        with _opened(path) as file:
+            return os.pread(file.fileno(), length, offset)
     except OSError as error:
         raise StorageError(
             f"{path.name} cannot be read: {error.strerror}", hint="was the spool changed by hand?"
         ) from error
+
+
+def _opened(path: Path) -> BinaryIO:
+    """A file, or its bytes so far where it is not whole yet; it may become that meanwhile."""
+    for place in (path, temporary_of(path)):
+        with suppress(FileNotFoundError):
+            return place.open("rb", buffering=0)
+    return path.open("rb", buffering=0)

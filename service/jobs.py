@@ -21,7 +21,7 @@ import msgspec
 
 from scanner.errors import ScannerError, StorageError
 from scanner.storage import replace_file, replace_json, storage_errors, sync_folder
-from scanner.wire import TERMINAL_STATES, ErrorBody, FileEntry, LiveStart, Refused, ScanStart, error_body
+from scanner.wire import TERMINAL_STATES, ArrayEntry, ErrorBody, FileEntry, LiveStart, Refused, ScanStart, error_body
 
 FORMAT = "fringed-job"
 VERSION = 1
@@ -92,6 +92,8 @@ class Job:
     output: str | None = None
     """folder of the scan's files, in the job's folder of the spool"""
     files: tuple[FileEntry, ...] = ()
+    arrays: tuple[ArrayEntry, ...] = ()
+    """of scan.npz, which can be read before that is whole"""
     report: dict[str, Any] = field(default_factory=dict)
     acknowledged: bool = False
     """its client has what it needs"""
@@ -126,6 +128,13 @@ class Job:
             self.error = error_body(error)
         if state.over:
             self.ended = time.time()
+
+    def readable(self, name: str) -> int | None:
+        """Bytes of a file that clients may fetch; of scan.npz, before it is whole, up to the arrays that are there."""
+        whole = next((entry.bytes for entry in self.files if entry.name == name), None)
+        if whole is None and name == "scan.npz" and self.arrays:
+            return max(array.offset + array.bytes for array in self.arrays)
+        return whole
 
     def status(self) -> dict[str, Any]:
         """What `scan.status` and `scan.list` say of it."""

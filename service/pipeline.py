@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from scanner.errors import ScannerError, StorageError
-from scanner.stream import DecodedNote, LiveCounts, Progress, Result
+from scanner.stream import DecodedNote, LiveCounts, PointsNote, Progress, Result
 from scanner.wire import LiveStart, Refused, ScanStart
 from service.deliveries import WorkerLost
 from service.devices_link import DevicesLink
@@ -273,7 +273,7 @@ class Pipeline:
         await self.end(job, JobState.DONE, reason=reason)
         await self.on_disk(series.remove_outputs, job.output)
 
-    def _hear(self, job: Job, message: Progress | DecodedNote | LiveCounts) -> None:
+    def _hear(self, job: Job, message: Progress | PointsNote | DecodedNote | LiveCounts) -> None:
         if job.state.over or isinstance(message, LiveCounts):
             return
         if isinstance(message, Progress):
@@ -284,6 +284,10 @@ class Pipeline:
             return
         if job.state not in (JobState.ACQUIRED, JobState.DECODING):
             return
+        if isinstance(message, PointsNote):
+            job.arrays = tuple(message.arrays)
+            self.tell(job, "points", {"file": "scan.npz", "arrays": msgspec.to_builtins(message.arrays)})
+            return
         job.files, job.report = tuple(message.files), message.report
         job.become(JobState.DECODED)
         self.tell(job, "decoded", {"report": message.report, "files": msgspec.to_builtins(message.files)})
@@ -291,7 +295,7 @@ class Pipeline:
     def _delivering(self, job: Job, number: int) -> None:
         job.deliveries += 1
         job.output = f"scan-{number}"
-        job.files = ()
+        job.files = job.arrays = ()
         if job.state in (JobState.DECODING, JobState.DECODED):
             job.become(JobState.ACQUIRED)
         self.spawn(self._note(job))

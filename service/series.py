@@ -16,7 +16,7 @@ from typing import Any
 
 from scanner.errors import StorageError
 from scanner.storage import storage_errors
-from scanner.stream import DecodedNote, EndReason, Frame, LiveCounts, Progress, Result
+from scanner.stream import DecodedNote, EndReason, Frame, LiveCounts, PointsNote, Progress, Result
 
 HEADER = "capture.json"
 RECORDS = "frames.jsonl"
@@ -44,7 +44,7 @@ class Series:
     outputs: Path
     """each delivery writes into a folder of its own in here"""
     options: Mapping[str, Any]
-    told: Callable[[Progress | DecodedNote | LiveCounts], None]
+    told: Callable[[Progress | PointsNote | DecodedNote | LiveCounts], None]
     delivering: Callable[[int], None]
     """hears of each delivery before it begins, with its number"""
     deliveries: int = 0

@@ -148,6 +148,8 @@ class Worker:
                 case Start() | Frame() | End() | LiveBegin() | LiveFrame():
                     if isinstance(message, Start | LiveBegin):
                         self._delivery = message.delivery
+                    elif isinstance(message, End):
+                        self._work.heard(message)
                     self._jobs.put(message)
 
     def _forward_answers(self) -> None:

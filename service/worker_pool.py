@@ -30,6 +30,7 @@ from scanner.stream import (
     Identify,
     Leaving,
     LiveCounts,
+    PointsNote,
     Progress,
     Ready,
     Released,
@@ -252,7 +253,7 @@ class WorkerPool:
             case Ack(frames=frames):
                 delivery.acked = max(delivery.acked, frames)
                 delivery.wake.set()
-            case Progress() | DecodedNote() | LiveCounts():
+            case Progress() | PointsNote() | DecodedNote() | LiveCounts():
                 delivery.series.told(message)
             case Result() | Failed() | Released():
                 self._over(seat, delivery, message)

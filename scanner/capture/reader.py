@@ -35,16 +35,26 @@ class Capture:
     does not exist.
     """
 
-    def __init__(self, path: Path, header: CaptureHeader, records: Sequence[FrameRecord] | None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        header: CaptureHeader,
+        records: Sequence[FrameRecord] | None,
+        checked: Mapping[int, str] | None = None,
+    ) -> None:
         self.path = path
         self.header = header
         self.all_records = tuple(records or ())
         self._slots = None if header.frames is not None else _map_frames(path, header)
-        self._records = self._present(records)
+        self._records = self._present(records, checked or {})
 
     @classmethod
-    def open(cls, path: Path) -> Capture:
+    def open(cls, path: Path, checked: Mapping[int, str] | None = None) -> Capture:
         """Open a folder (its capture.json), the folder of a scan (the capture in there) or a JSON file.
+
+        Args:
+            path: folder or file.
+            checked: digests by slot, which the caller has held against the pixels already.
 
         Raises:
             DecodeError: missing, unreadable or contradictory, with what and where.
@@ -61,7 +71,7 @@ class Capture:
             raise DecodeError(f"{file} is not JSON: {error}") from error
         header = CaptureHeader.from_dict(content, str(file))
         records = _read_records(file.parent / RECORDS_FILE) if header.frames is None else None
-        return cls(file.parent, header, records)
+        return cls(file.parent, header, records, checked)
 
     @property
     def records(self) -> Mapping[int, FrameRecord]:
@@ -98,7 +108,7 @@ class Capture:
         frame: Pixels = self._slots[slot]
         return _within_range(frame, self.header.camera, f"{self.path / FRAMES_FILE}, slot {slot}")
 
-    def _present(self, records: Sequence[FrameRecord] | None) -> dict[int, FrameRecord]:
+    def _present(self, records: Sequence[FrameRecord] | None, checked: Mapping[int, str]) -> dict[int, FrameRecord]:
         count = self.header.frame_count
         if self.header.frames is not None:
             if len(self.header.frames) != count:
@@ -124,7 +134,7 @@ class Capture:
             if record.status == "ok"
             and record.slot is not None
             and record.slot < len(slots)
-            and digest_matches(slots[record.slot], record.xxh3)
+            and (checked.get(record.slot, "") == record.xxh3 or digest_matches(slots[record.slot], record.xxh3))
         }
 
 

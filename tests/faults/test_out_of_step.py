@@ -12,9 +12,10 @@ import pytest
 from scanner.capture import Capture, CaptureHeader, CaptureWriter, FrameRecord
 from scanner.decode import Decoded, Reason
 from scanner.devices import TriggerMode
+from scanner.empty_scan import raise_if_empty
 from scanner.errors import DecodeError, DeviceLost, SyncError
 from scanner.patterns import PatternSequence, PmpPattern
-from scanner.reconstruct import raise_if_empty, reconstruct
+from scanner.reconstruct import reconstruct
 from scanner.sequencer import FinishReason, check_capture
 from tests.unit.sequencer_bench import Taken, gray, pmp, take
 

@@ -74,7 +74,17 @@ def test_scan_gives_arrays(client: Client) -> None:
 
 def test_multi_frame_scan_into_a_folder_with_events(client: Client, tmp_path: Path) -> None:
     events: list[Event] = []
-    scan = client.scan("pmp", folder=tmp_path, on_event=events.append, compare_truth=True)
+    early: dict[str, Any] = {}
+
+    def heard(event: Event) -> None:
+        events.append(event)
+        if event.kind == "points":
+            early.update(client.arrays(event))
+
+    scan = client.scan("pmp", folder=tmp_path, on_event=heard, compare_truth=True)
+    assert early.keys() == {"xyz", "confidence"}
+    for name, array in early.items():
+        np.testing.assert_array_equal(array, getattr(scan, name))
     assert scan.rows is not None
     assert scan.report["truth"]["lit"]["coverage"] > 0.9
     names = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
