@@ -34,16 +34,20 @@ def gige(
     address: Annotated[str, typer.Option(metavar="IP", help="Address of the first camera, 127.x.x.x.")] = "127.0.0.2",
     count: Annotated[int, typer.Option(metavar="N", min=1, max=64, help="Cameras, at addresses that follow.")] = 1,
     loss: Annotated[
-        float, typer.Option(metavar="SHARE", min=0.0, max=0.9, help="Share of packets that never arrive.")
+        float, typer.Option(metavar="SHARE", min=0.0, max=0.9, help="Share of packets that never arrive, 0 .. 0.9.")
     ] = 0.0,
     queue: Annotated[
         int, typer.Option(metavar="N", min=0, max=64, help="Triggers remembered while busy; 0: dropped.")
     ] = 0,
-    link: Annotated[float, typer.Option(metavar="MBIT/S", min=0.0, help="Speed of the wire; 0: unlimited.")] = 0.0,
+    link: Annotated[
+        float, typer.Option(metavar="MBIT/S", min=0.0, help="Speed of the wire, Mbit/s; 0: unlimited.")
+    ] = 0.0,
     ring: Annotated[
         int, typer.Option(metavar="N", min=0, max=4096, help="Send so many prepared frames in turn: fast.")
     ] = 0,
-    readout: Annotated[float, typer.Option(metavar="MS", min=0.01, max=1000.0, help="Duration of a readout.")] = 5.0,
+    readout: Annotated[
+        float, typer.Option(metavar="MS", min=0.01, max=1000.0, help="Duration of a readout, ms.")
+    ] = 5.0,
     shutter: Annotated[str, typer.Option(metavar="global|rolling", help="How the sensor is read.")] = "global",
     light: Annotated[
         Path | None, typer.Option(metavar="PATH", help="Socket at which a simulated projector finds the camera.")
@@ -55,6 +59,8 @@ def gige(
 ) -> int:
     """Put simulated GigE Vision cameras on this machine's loopback network, until interrupted.
 
+    They answer any program that speaks GigE Vision: fringed devices lists them, a rig file names one by its address.
+
     \b
     Examples:
       fringed simulate gige
@@ -64,8 +70,11 @@ def gige(
       fringed scan --rig scans/gige.toml
     """
     from drivers.registry import load_simulator  # noqa: PLC0415
+    from scanner.storage import try_file  # noqa: PLC0415
     from service.logs import start_logging  # noqa: PLC0415
 
+    if calibration is not None:
+        try_file(calibration)
     serve = load_simulator("gige")
     start_logging("simulate")
     wire = {"loss": loss, "queue": queue, "link_mbit_s": link}
@@ -76,6 +85,7 @@ def gige(
         if as_json:
             print_json(dict(service.facts))
         else:
-            print_facts("simulated GigE Vision cameras", list(service.facts))
+            piece = f'camera = {{ driver = "aravis", device = "{address}" }}'
+            print_facts("simulated GigE Vision cameras", [*service.facts, ("in a rig file", piece), ("end", "Ctrl-C")])
         while True:  # until a signal's exception
             threading.Event().wait(3600.0)
