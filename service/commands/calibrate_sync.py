@@ -53,6 +53,8 @@ def sync(
             "measure again while the machine has nothing else to do, with a brighter view",
             label="warning",
         )
+    if warning := (found.exposure or {}).get("warning"):
+        print_error(warning, label="warning")
     kept = set_values(Path(rig), "projector", found.rig_lines()) if write and not found.is_poor else None
     if as_json:
         print_json({**found.as_dict(), "written": kept is not None})
