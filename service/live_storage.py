@@ -18,7 +18,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from scanner.capture import FRAMES_FILE, CaptureHeader, CaptureWriter, FrameRecord, State, digest
+from scanner.capture import CaptureHeader, CaptureWriter, FrameRecord, State, digest
 from scanner.devices import Pixels
 from scanner.errors import StorageError
 from scanner.patterns import CameraFormat
@@ -252,8 +252,3 @@ class Recording:
         except StorageError:
             return  # it was never needed
         self._disk.submit(self._close, segment, "failed", None).result()
-
-
-def frame_path(folder: Path, index: int) -> Path:
-    """The frames file of one folder of a series."""
-    return folder / segment_name(index) / FRAMES_FILE
