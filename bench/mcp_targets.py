@@ -3,12 +3,14 @@
     python bench/mcp_targets.py [--seeds 3] [--only texture,blocks] [--short]
 
 Every figure is the worst of all seeds on casey2011 with the true calibration; `how right` is said in mcp_accuracy.py.
-A line ends in `ok` (the aim is reached), `must` (what must be is) or `SHORT`. Time is not measured here but in mcp.py.
+A line ends in `ok` (the aim is reached), `must` (what must be is) or `SHORT`; exit status 1 if one does. Time is not
+measured here but in mcp.py.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -208,10 +210,11 @@ def verdict(value, must, aim, more):
 
 
 def line(group, what, figure, value, must, aim, more, short):
-    """Print one row."""
+    """Print one row; whether it falls short."""
     said = verdict(value, must, aim, more)
     if not short or said == "SHORT":
         print(f"{group:10s} {what:16s} {figure:8s} {value:9.4f}   must {must:7.4f}  aim {aim:7.4f}  {said}", flush=True)
+    return said == "SHORT"
 
 
 def main():
@@ -222,7 +225,7 @@ def main():
     chosen = parser.parse_args()
     only = set(filter(None, chosen.only.split(",")))
     patterns = {"own": OWN, "published": PUBLISHED}
-    known = {}
+    known, missed = {}, 0
     for row in ROWS:
         for scene in row.scenes:
             if only and not only & {row.group, scene}:
@@ -230,34 +233,38 @@ def main():
             if (row.pattern, scene) not in known:
                 known[row.pattern, scene] = scene_figures(scene, patterns[row.pattern], chosen.seeds)
             value = worst(known[row.pattern, scene], row.figure, row.more)
-            line(row.group, scene, row.name, value, row.must, row.aim, row.more, chosen.short)
+            missed += line(row.group, scene, row.name, value, row.must, row.aim, row.more, chosen.short)
     if not only or "robust" in only:
-        robust(chosen.seeds, chosen.short)
+        missed += robust(chosen.seeds, chosen.short)
     if not only or "strips" in only:
         for width, (right, share, refused) in strips(chosen.seeds).items():
             told = f"strips     {width:3d} px           right {right:9.4f}   decided {share:6.3f}  refused {refused}"
             wide = "SHORT" if (width >= 51 and not (right >= 0.99 and share >= 0.9)) else ""
             wrong = "SHORT" if width < 51 and right < 0.99 else ""
+            missed += bool(wide or wrong)
             print(told, wide or wrong or ("ok" if width >= 25 and right >= 0.99 else ""), flush=True)
     if not only or "white" in only:
         found = []
         for seed in range(chosen.seeds):
             found.append(figures_of(measure(*take_white(f"casey2011/textured?seed={seed}", OWN))[1]))
-        line("white", "textured", "zmed", worst(found, "zmed", False), 0.08, 0.05, False, chosen.short)
-        line("white", "textured", "recall", worst(found, "recall", True), 0.86, 0.93, True, chosen.short)
+        missed += line("white", "textured", "zmed", worst(found, "zmed", False), 0.08, 0.05, False, chosen.short)
+        missed += line("white", "textured", "recall", worst(found, "recall", True), 0.86, 0.93, True, chosen.short)
+    return 1 if missed else 0
 
 
 def robust(seeds, short):
-    """Boards, sphere and bust under bad conditions."""
+    """Boards, sphere and bust under bad conditions; how many figures fall short."""
+    missed = 0
     targets = {"board": (0.999, 1), "sphere_board": (0.985, 0.995), "bust": (0.95, 0.99)}
     for what, (options, gamma) in ROBUST.items():
         for scene, (must, aim) in targets.items():
             found = scene_figures(scene, replace(OWN), seeds, options, gamma)
-            line(what[:10], scene, "right", worst(found, "right", True), must, aim, True, short)
+            missed += line(what[:10], scene, "right", worst(found, "right", True), must, aim, True, short)
             if scene == "board":
-                line(what[:10], scene, "zmed", worst(found, "zmed", False), 0.3, 0.1, False, short)
-            line(what[:10], scene, "recall", worst(found, "recall", True), 0.5, 0.9, True, short)
+                missed += line(what[:10], scene, "zmed", worst(found, "zmed", False), 0.3, 0.1, False, short)
+            missed += line(what[:10], scene, "recall", worst(found, "recall", True), 0.5, 0.9, True, short)
+    return missed
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
