@@ -18,7 +18,7 @@ import zmq
 
 from scanner.capture import Capture
 from scanner.client import AsyncClient, Client
-from scanner.errors import ConfigError, DecodeError, DeviceBusy, ScannerError
+from scanner.errors import ConfigError, DeviceBusy, ScannerError
 from scanner.geometry import calibration_from_dict, load_calibration
 from scanner.reconstruct import DecodeOptions
 from scanner.reconstruct_live import LiveReconstruction
@@ -130,7 +130,7 @@ def test_one_at_a_time_and_no_scan_meanwhile(client: Client) -> None:
         ({"pattern": {"carriers": [1, 2]}}, ConfigError, "carriers"),
         ({"exposure": 1e9}, ConfigError, "exposure"),
         ({"filters": {"depth": [9.0, 1.0]}}, ConfigError, "depth"),
-        ({"decoder": "none such"}, DecodeError, "none such"),
+        ({"decoder": "none such"}, ConfigError, "none such"),
         ({"stride": 0}, Refused, "stride"),
         ({"retain": "some"}, Refused, "retain"),
         ({"method": "pmp"}, Refused, "method"),
