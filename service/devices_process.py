@@ -94,13 +94,24 @@ class DevicesProcess:
                 return 1
 
     def _patience(self) -> float | None:
-        pauses = (self._devices.pause_s(), None if self._previewer is None else self._previewer.pause_s())
+        pauses = (
+            self._devices.pause_s() if self._is_idle else None,
+            None if self._previewer is None else self._previewer.pause_s(),
+        )
         return min((pause for pause in pauses if pause is not None), default=None)
+
+    @property
+    def _is_idle(self) -> bool:
+        """Nobody looks at pictures, which would tell a lost device."""
+        return self._previewer is None or self._previewer.resting
 
     def _idle(self) -> None:
         """What is due while no command waits."""
-        if self._previewer is None:
+        if self._is_idle:
             self._devices.mind()
+        if self._devices.opened is None:
+            self._end_preview()
+        if self._previewer is None or self._previewer.pause_s() > 0:
             return
         try:
             self._previewer.show()
@@ -162,10 +173,14 @@ class DevicesProcess:
             self._outbox.post(Counted(dict(self._counts)))
 
     def _lose(self, error: ScannerError) -> None:
+        self._end_preview()
+        self._devices.lose(error)
+
+    def _end_preview(self) -> None:
+        """The daemon asks for it again when the devices are back."""
         if self._previewer is not None:
             self._previewer.close()
-            self._previewer = None  # the daemon asks for it again when the devices are back
-        self._devices.lose(error)
+            self._previewer = None
 
     def _made(self, command: Acquire | AcquireLive, opened: OpenRig) -> Scan:
         if isinstance(command, AcquireLive):
@@ -194,8 +209,7 @@ class DevicesProcess:
     def _set_preview(self, command: Preview) -> None:
         opened = self._devices.opened
         if self._previewer is not None:
-            self._previewer.close()
-            self._previewer = None
+            self._end_preview()
             if opened is not None:
                 opened.loaded = None
         if command.rate_hz > 0 and opened is not None:

@@ -31,6 +31,9 @@ FASTER, SLOWER = 0.4, 4.0
 """Factors on the exposure from one picture to the next: what is clipped does not say by how much."""
 LIT_NS = 300_000_000
 """After the projector was told to show white (slow ones take 0.1 s): pictures from before say nothing of its light."""
+UNWATCHED_NS = 10_000_000_000
+"""Without a subscriber for so long the projector goes black and the camera rests, until there is one again: who asked
+for the preview may have been killed, and lamps do not last for ever."""
 LONGEST_NS = 200_000_000
 """Exposure that a preview goes to by itself: five pictures a second, also of a dark view."""
 
@@ -49,8 +52,13 @@ class Previewer:
         self._numbers = itertools.count(1)
         self._next_ns = clock.now_ns()
         self._running = False
+        self._lit = False
         self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.PUB)
+        self._socket = self._context.socket(zmq.XPUB)
+        self._topics: set[bytes] = set()
+        self._watched_ns = clock.now_ns()
+        self.resting = False
+        """nobody watches"""
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.SNDHWM, 2)
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
@@ -66,12 +74,14 @@ class Previewer:
         return max(0.0, (self._next_ns - self._clock.now_ns()) / 1e9)
 
     def show(self) -> None:
-        """Take a picture and publish it.
+        """Take a picture and publish it, unless nobody watches.
 
         Raises:
             DeviceError: camera or projector failed.
         """
         self._next_ns = max(self._next_ns + self._period_ns, self._clock.now_ns())
+        if not self._is_watched():
+            return
         camera = self._rig.camera
         self._begin()
         if self._mode is TriggerMode.SOFTWARE:
@@ -100,12 +110,37 @@ class Previewer:
                 camera.stop()  # the pixels were the camera's until here
                 self._start()
 
+    def _is_watched(self) -> bool:
+        """Whether somebody has subscribed, or had of late; when they are gone the light is put out."""
+        with suppress(zmq.Again):
+            while True:  # XPUB: 1 or 0, and what was subscribed to first or is not any more by the last
+                said = self._socket.recv(zmq.DONTWAIT)
+                (self._topics.add if said[:1] == b"\x01" else self._topics.discard)(said[1:])
+        now = self._clock.now_ns()
+        if self._topics:
+            self._watched_ns = now
+        watched = now - self._watched_ns <= UNWATCHED_NS
+        if self._running and not watched:
+            self._rig.camera.stop()
+            self._running = False
+            self._light(0)
+        self.resting = not watched
+        return watched
+
+    def _light(self, grey: int) -> None:
+        size = self._rig.projector.capabilities
+        image: Image = np.full((size.height, size.width), grey, np.uint8)
+        self._lit = True
+        self._rig.projector.load([image])
+        self._rig.projector.show(0)
+
     def rest(self) -> bool:
-        """Stop the camera for a scan; the next `show` starts it again. Whether it ran."""
+        """Stop the camera for a scan; the next `show` starts it again. Whether the projector was given an image."""
         ran, self._running = self._running, False
         if ran:
             self._rig.camera.stop()
-        return ran
+        lit, self._lit = self._lit, False
+        return lit
 
     def close(self) -> None:
         """End the preview."""
@@ -116,11 +151,8 @@ class Previewer:
     def _begin(self) -> None:
         if self._running:
             return
-        projector, camera = self._rig.projector, self._rig.camera
-        size = projector.capabilities
-        white: Image = np.full((size.height, size.width), 255, np.uint8)
-        projector.load([white])
-        projector.show(0)
+        camera = self._rig.camera
+        self._light(255)
         modes = camera.capabilities.trigger_modes
         self._mode = TriggerMode.SOFTWARE if TriggerMode.SOFTWARE in modes else TriggerMode.FREE
         self._lit_ns = self._clock.now_ns() + LIT_NS

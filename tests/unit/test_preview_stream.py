@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ import zmq
 from scanner.sequencer import Rig
 from scanner.wire_images import decode_preview
 from service.pipe import Preview
-from service.preview import BRIGHT, DARK, LONGEST_NS, Previewer, better_exposure
+from service.preview import BRIGHT, DARK, LONGEST_NS, UNWATCHED_NS, Previewer, better_exposure
 from tests.unit.simulated_bench import SECOND_NS, Bench
 
 
@@ -49,6 +51,47 @@ def test_pictures_find_their_own_exposure(scale: float, tmp_path: Path) -> None:
 def test_a_rig_files_exposure_is_kept(tmp_path: Path) -> None:
     levels = shown("quick/board?exposure_scale=12", tmp_path, 2000.0, 14)
     assert levels[-2:] == pytest.approx([230 / 255 * 12 * 2 / 33.333] * 2, abs=0.05)
+
+
+def test_without_anybody_who_looks_the_light_goes_out_until_there_is_somebody(tmp_path: Path) -> None:
+    bench = Bench("quick/board")
+    endpoint = f"ipc://{tmp_path}/preview.ipc"
+    previewer = Previewer(
+        Rig(projector=bench.projector, camera=bench.camera), bench.clock, Preview(endpoint, 10.0, 400), 9e3
+    )
+    loaded: list[int] = []
+    load = bench.projector.load
+    with pytest.MonkeyPatch.context() as patch, zmq.Context() as context:
+        patch.setattr(bench.projector, "load", lambda images: loaded.append(int(images[0].max())) or load(images))
+        for _ in range(2):
+            with context.socket(zmq.SUB) as watching:
+                watching.setsockopt(zmq.LINGER, 0)
+                watching.setsockopt(zmq.SUBSCRIBE, b"")
+                watching.connect(endpoint)
+                shows(previewer, bench, lambda watching=watching: watching.poll(1))
+                assert loaded[-1] == 255
+                bench.clock.sleep_until(bench.clock.now_ns() + 2 * UNWATCHED_NS)
+                previewer.show()
+                assert not previewer.resting, "somebody looks"
+            shows(previewer, bench, lambda: previewer.resting)
+            assert loaded[-1] == 0
+            assert previewer.rest(), "the projector holds what no scan loaded"
+        assert not previewer.rest()
+        assert loaded == [255, 0, 255, 0]
+    previewer.close()
+    bench.camera.close()
+    bench.projector.close()
+
+
+def shows(previewer: Previewer, bench: Bench, until: Callable[[], object]) -> None:
+    """Pictures, a second apart, until something is so: ZeroMQ's own threads take some milliseconds."""
+    for _ in range(1000):
+        previewer.show()
+        if until():
+            return
+        time.sleep(0.002)
+        bench.clock.sleep_until(bench.clock.now_ns() + SECOND_NS)
+    pytest.fail("it never came")
 
 
 def test_exposure_has_bounds(tmp_path: Path) -> None:
