@@ -13,8 +13,8 @@
 #
 # Output comes as it is made, and the exit status is the command's; 125 means that the guest itself failed, 124 that
 # something took longer than it may, 77 that packages cannot be had. RIG_TIMEOUT: seconds a guest may take once it is up,
-# 900 unless given; RIG_BOOT: until it is up, 300 unless given; RIG_BUDGET: all together; no bound unless given. RIG_CPUS:
-# the guest's processors, 2 unless given.
+# 900 unless given; RIG_BOOT: until it is up, 300 unless given, twice that with systemd; RIG_BUDGET: all together; no bound
+# unless given. RIG_CPUS: the guest's processors, 2 unless given.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 clone=$PWD
@@ -133,7 +133,7 @@ boot() {
     mkfifo "$run/output" # not QEMU's stdio: a guest's port is shut when standard input ends
     cat "$run/output" &
     reader=$!
-    within $((${RIG_BOOT:-300} + ${RIG_TIMEOUT:-900})) "the guest"
+    within $((2 * ${RIG_BOOT:-300} + ${RIG_TIMEOUT:-900})) "the guest"
     began=$SECONDS
     start_qemu
     await_guest
@@ -173,10 +173,11 @@ start_qemu() {
 
 # Until QEMU ended; a guest that does not come up in time, or is not done in time, is ended.
 await_guest() {
-    local up=
+    local up= patience=${RIG_BOOT:-300}
+    [ "$mode" = fast ] || patience=$((2 * patience))
     while kill -0 "$child" 2>/dev/null; do
         [ -n "$up" ] || ! grep -qs '^up$' "$run/status" || up=$SECONDS
-        if [ -z "$up" ] && [ $((SECONDS - began)) -gt "${RIG_BOOT:-300}" ]; then late "the guest's start" "${RIG_BOOT:-300}"; fi
+        if [ -z "$up" ] && [ $((SECONDS - began)) -gt "$patience" ]; then late "the guest's start" "$patience"; fi
         if [ -n "$up" ] && [ $((SECONDS - up)) -gt "${RIG_TIMEOUT:-900}" ]; then late "the guest's command" "${RIG_TIMEOUT:-900}"; fi
         sleep 0.5
     done
@@ -210,15 +211,15 @@ tests() {
 }
 
 # For a script that others wait for. What is not the tests' word (77: packages cannot be had; 124: too slow here; 125: the
-# guest itself failed) is told and no failure. A guest that takes so long to start is so slow that clocks are no clocks in
-# it, and what its tests say of promised times means nothing: it takes 12 s on two quiet processors.
+# guest itself failed) is told and no failure. A guest that takes longer than RIG_BOOT to start is so slow that clocks are
+# no clocks in it, and what its tests say of promised times means nothing: it takes 12 s where they were made.
 tests_if_possible() {
     local status=0 why budget
     RIG_BUDGET=${RIG_BUDGET:-1800}
     why=$(obstacle)
     if [ -n "$why" ]; then say "tests/rig was not run: $why"; return 0; fi
     budget=$((RIG_BUDGET - SECONDS))
-    RIG_BUDGET=$budget RIG_BOOT=${RIG_BOOT:-60} timeout --kill-after=20 $((budget + 30)) setup/rig.sh tests &
+    RIG_BUDGET=$budget RIG_BOOT=${RIG_BOOT:-45} timeout --kill-after=20 $((budget + 30)) setup/rig.sh tests &
     child=$!
     wait "$child" || status=$?
     child=

@@ -64,6 +64,7 @@ def _check_lost(projector: KmsProjector, *, has_images: bool) -> None:
             projector.show(0)
 
 
+@pytest.mark.real_time
 @pytest.mark.usefixtures("card")
 @pytest.mark.parametrize("state", ["idle", "loaded", "mid-sequence"])
 def test_a_card_taken_away_is_lost_at_once_and_works_when_it_is_back(state: str) -> None:

@@ -119,6 +119,7 @@ def test_a_table_runs_and_every_pulse_is_told_or_its_loss() -> None:
     pytest.fail("never a whole run")
 
 
+@pytest.mark.real_time
 @pytest.mark.usefixtures("simulated")
 @pytest.mark.parametrize("state", ["idle", "armed", "mid-sequence"])
 def test_a_board_pulled_out_is_lost_at_once(state: str) -> None:
@@ -150,6 +151,7 @@ def _use_until_lost(board: SerialTriggerBoard, state: str) -> None:
             time.sleep(0.01)
 
 
+@pytest.mark.real_time
 @pytest.mark.usefixtures("simulated")
 def test_a_board_put_back_works_within_seconds() -> None:
     def put_back() -> float:

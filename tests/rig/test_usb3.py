@@ -138,6 +138,7 @@ def test_one_that_somebody_else_has_is_busy() -> None:
         pass
 
 
+@pytest.mark.real_time
 @pytest.mark.usefixtures("plugged")
 @pytest.mark.parametrize("state", ["idle", "mid-sequence"])
 def test_one_pulled_out_is_lost_at_once_and_found_again(state: str) -> None:

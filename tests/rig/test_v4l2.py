@@ -123,6 +123,7 @@ def _sent_by_kms(images: list[np.ndarray]) -> list[np.ndarray]:
 # --- counts, stamps, controls -----------------------------------------------------------------------------------
 
 
+@pytest.mark.real_time
 def test_frames_that_nobody_fetched_show_as_a_gap() -> None:
     with camera(buffers=3) as seen:
         seen.start(TriggerMode.FREE)

@@ -12,6 +12,7 @@ from tests.contract.suite import CameraBench, CameraContract, ProjectorBench, Pr
 from tests.rig import vivid
 
 
+@pytest.mark.real_time
 class TestV4l2Camera(CameraContract):
     @pytest.fixture(params=("GREY", "Y16", "YUYV"))
     def bench(self, request: pytest.FixtureRequest) -> Iterator[CameraBench]:
@@ -23,6 +24,7 @@ class TestV4l2Camera(CameraContract):
         camera.close()
 
 
+@pytest.mark.real_time
 class TestV4l2Output(ProjectorContract):
     @pytest.fixture(params=("XR24", "GREY"))
     def bench(self, request: pytest.FixtureRequest) -> Iterator[ProjectorBench]:
