@@ -31,6 +31,9 @@ PATIENCE_S = 2.0
 LONG_LIVED = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
 """Helpers that Python keeps until it exits, by design"""
 
+LONG_LIVED_THREADS = "strips_"
+"""Those that share the pass over an image (`scanner.decode.strips`); they wait for the next one until Python exits"""
+
 KERNEL_THREAD = 0x0020_0000
 """PF_KTHREAD among the flags of /proc/PID/stat (proc(5)): it has neither command line nor environment"""
 
@@ -111,7 +114,11 @@ def _compare(before: Traces, places: tuple[Path, Path], what: str) -> None:
 def _traces(places: tuple[Path, Path]) -> Traces:
     return Traces(
         processes=frozenset(_processes()),
-        threads=frozenset(f"{thread.name} ({thread.ident})" for thread in threading.enumerate()),
+        threads=frozenset(
+            f"{thread.name} ({thread.ident})"
+            for thread in threading.enumerate()
+            if not thread.name.startswith(LONG_LIVED_THREADS)
+        ),
         sockets=frozenset(_sockets()),
         files=frozenset(str(path) for place in places for path in place.iterdir()),
     )

@@ -33,7 +33,8 @@ def addresses_of(frames: Sequence[NDArray[Any]]) -> NDArray[np.intp]:
     """
     if any(not frame.flags.c_contiguous for frame in frames):
         raise ValueError("a frame without gaps is needed")
-    return np.array([frame.ctypes.data for frame in frames], dtype=np.intp)
+    # Quicker than `frame.ctypes.data`, which makes an object each time.
+    return np.array([frame.__array_interface__["data"][0] for frame in frames], dtype=np.intp)
 
 
 @kernel

@@ -64,7 +64,7 @@ def agreement(
     """
     found = []
     for j, remainder in enumerate(remainders_of(ladder, phases, centre)):
-        errors2 = ladder.errors[j] ** 2
+        errors2 = np.asarray(ladder.errors[j] ** 2, np.float32)
         low, high = ladder.frequencies[j : j + 2]
         found.append(_remainder(low, high, remainder, errors2 @ cycles2, float(errors2.sum()), floor_cycles))
     return found
@@ -134,7 +134,7 @@ def _remainder(
     low: float,
     high: float,
     remainder: NDArray[np.float64],
-    variance: NDArray[np.float64],
+    variance: NDArray[np.float32],
     weight: float,
     least: float,
 ) -> Remainder:
@@ -143,7 +143,7 @@ def _remainder(
     order = np.argsort(variance)[: remainder.size // _NOISE_BINS * _NOISE_BINS].reshape(_NOISE_BINS, -1)
     middle = order.shape[1] // 2
     x = variance[order[:, middle]]
-    medians = np.partition(np.abs(remainder)[order], middle, axis=1)[:, middle]
+    medians = np.partition(np.abs(remainder).astype(np.float32)[order], middle, axis=1)[:, middle]
     y = np.array([_sigma_of_median(float(median)) ** 2 for median in medians])
     # Weights 1 / y: a variance's own error grows with it.
     rest = max(float(np.average(y - x, weights=1 / np.maximum(y, 1e-12))), 0.0)

@@ -9,7 +9,7 @@ told apart, and shifts all phases of a set together with it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ class Flicker:
 
     def as_dict(self) -> dict[str, Any]:
         """For report.json."""
-        return asdict(self)
+        return dict(vars(self))
 
     def warning(self, axis: str, random_px: float) -> str | None:
         """What a user should know, where it is a quarter of the noise's variance, in which it is counted, or more."""

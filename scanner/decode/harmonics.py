@@ -10,7 +10,8 @@ of a scan contradict one another N times a period. Nothing here corrects a pixel
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -65,7 +66,7 @@ class SetHarmonics:
 
     def as_dict(self) -> dict[str, Any]:
         """For report.json."""
-        return asdict(self)
+        return {**vars(self), "ripple": None if self.ripple is None else dict(vars(self.ripple))}
 
 
 @dataclass(frozen=True)
@@ -137,7 +138,13 @@ def height_weights(alpha: NDArray[np.float64]) -> NDArray[np.float32]:
 
     The order N / 2 is turned so that its height is real: a cosine and a sine of it cannot be told apart.
     """
-    shifts = len(alpha)
+    return _height_weights(tuple(alpha.tolist()))
+
+
+@lru_cache(maxsize=64)
+def _height_weights(angles: tuple[float, ...]) -> NDArray[np.float32]:
+    # Every scan of a rig asks for the same.
+    alpha, shifts = np.array(angles), len(angles)
     turns = np.arange(1, min(ORDERS, shifts // 2) + 1)[:, None] * alpha
     weights = np.stack([np.cos(turns), -np.sin(turns)], axis=1) * (2 / shifts)
     if folded := _folded(shifts):

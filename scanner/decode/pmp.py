@@ -8,7 +8,6 @@ from the residual of the fit where a set has four shifts or more, else from how 
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -180,15 +179,15 @@ class PmpDecoder:
         return {
             "method": "pmp",
             "counts": {r.name.lower(): int(counts[r]) for r in Reason if counts[r]},
-            "thresholds": asdict(self._thresholds),
-            "noise": asdict(noise),
+            "thresholds": dict(vars(self._thresholds)),
+            "noise": dict(vars(noise)),
             "unwrapping": {
                 axis: {
                     "frequencies": [float(f) for f in found.ladder.frequencies],
                     "combinations": found.ladder.combinations.tolist(),
-                    "remainders": [asdict(r) for r in found.remainders],
+                    "remainders": [dict(vars(r)) for r in found.remainders],
                     "settled_by_neighbours": found.settled,
-                    "ripple": None if found.ripple is None else asdict(found.ripple),
+                    "ripple": None if found.ripple is None else dict(vars(found.ripple)),
                 }
                 for axis, found in self._found.items()
             },

@@ -165,9 +165,10 @@ def decode_axis(
     least = max(t.min_modulation_levels, t.min_modulation_share * sample.brightest(finest))
     sample, light = judge_light(sample, frames, pattern.frequencies, along, least, t.min_modulation_sigmas)
     noise = sample.noise(ladder, centre, least, t.min_modulation_sigmas)
-    remainders = sample.agreement(ladder, noise, centre, least, t.min_modulation_sigmas, t.phase_floor_cycles)
+    judged = sample.judged(noise, least, t.min_modulation_sigmas)
+    remainders = judged.agreement(ladder, centre, t.phase_floor_cycles)
     per_cycle = along / float(ladder.frequencies[-1])
-    random_px = per_cycle * sample.phase_sigma(noise, finest, least, t.min_modulation_sigmas)
+    random_px = per_cycle * judged.phase_sigma(finest)
     light = judge_ripple(
         light, frames, sample, pixels, t.clip(camera), ladder, noise, centre, along, least, t.min_modulation_sigmas
     )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -57,36 +58,54 @@ def axis_frames(pattern: PmpPattern, axis: Axis, by_fringe: Mapping[int, NDArray
         by_fringe: frames without gaps in memory, by fringe index.
     """
     frames: list[NDArray[Any]] = []
+    there = []
+    for fringe_set in pattern.sets():
+        if fringe_set.axis == axis:
+            have = tuple(n for n in range(fringe_set.shifts) if fringe_set.first + n in by_fringe)
+            frames += [by_fringe[fringe_set.first + n] for n in have + have[:1] * (-len(have) % GROUP)]
+            there.append(have)
+    fits = _fits_of(pattern, tuple(there))
+    return AxisFrames(
+        frames, addresses_of(frames), fits.starts, fits.weights, fits.grams, fits.whole, fits.gains, fits.freedom,
+        fits.angles,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Fits:
+    """What of `AxisFrames` owes nothing to the frames."""
+
+    starts: NDArray[np.intp]
+    weights: NDArray[np.float32]
+    grams: NDArray[np.float32]
+    whole: NDArray[np.intp]
+    gains: tuple[float, ...]
+    freedom: int
+    angles: tuple[NDArray[np.float64], ...]
+
+
+@lru_cache(maxsize=32)
+def _fits_of(pattern: PmpPattern, there: tuple[tuple[int, ...], ...]) -> _Fits:
+    # Every scan of a rig asks for the same, and nobody writes into it.
     starts, weights, grams, whole, gains, freedom = [0], [], [], [], [], 0
     angles: list[NDArray[np.float64]] = []
-    for fringe_set in pattern.sets():
-        if fringe_set.axis != axis:
-            continue
-        have = [n for n in range(fringe_set.shifts) if fringe_set.first + n in by_fringe]
-        design = design_matrix(pattern, fringe_set.shifts, have)
+    for shifts, have in zip(pattern.shifts, there, strict=True):
+        design = design_matrix(pattern, shifts, have)
         gram = design.T @ design
         inverse = np.linalg.inv(gram)
         padding = -len(have) % GROUP
         weights.append(np.pad(inverse @ design.T, ((0, 0), (0, padding))))
         grams.append([gram[0, 0], gram[1, 1], gram[2, 2], 2 * gram[0, 1], 2 * gram[0, 2], 2 * gram[1, 2]])
-        whole.append(fringe_set.shifts if fringe_set.shifts == len(have) in (4, 8) else 0)
+        whole.append(shifts if shifts == len(have) in (4, 8) else 0)
         gains.append(round(float(inverse[1, 1] + inverse[2, 2]) / 2, 9))
         freedom += len(have) - 3
-        alpha = shift_angles(pattern, fringe_set.shifts, have)
-        angles.append(alpha if len(have) == fringe_set.shifts else alpha[:0])
-        frames += [by_fringe[fringe_set.first + n] for n in have + have[:1] * padding]
-        starts.append(len(frames))
-    return AxisFrames(
-        frames,
-        addresses_of(frames),
-        np.array(starts, np.intp),
-        np.concatenate(weights, axis=1).astype(np.float32),
-        np.array(grams, np.float32),
-        np.array(whole, np.intp),
-        tuple(gains),
-        freedom,
-        tuple(angles),
-    )
+        alpha = shift_angles(pattern, shifts, have)
+        angles.append(alpha if len(have) == shifts else alpha[:0])
+        starts.append(starts[-1] + len(have) + padding)
+    return _Fits(
+        np.array(starts, np.intp), np.concatenate(weights, axis=1).astype(np.float32), np.array(grams, np.float32),
+        np.array(whole, np.intp), tuple(gains), freedom, tuple(angles),
+    )  # fmt: skip
 
 
 def design_matrix(pattern: PmpPattern, shifts: int, have: Sequence[int]) -> NDArray[np.float64]:

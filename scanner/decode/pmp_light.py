@@ -117,12 +117,12 @@ def judge_ripple(
     and only many phases tell the two apart.
 
     Args:
-        pixels: of a frame. clip: see `take_sample`. The others: see `Sample.agreement`.
+        pixels: of a frame. clip: see `take_sample`. The others: see `Sample.judged` and `judge_light`.
     """
     if all(s.shifts >= FEWEST_SHIFTS_UNHARMED for s in light.harmonics):
         return light
     fine = replace(take_fine_sample(frames, pixels, sample.max_value, clip), prior=sample.prior)
-    phases = fine.phases[:, fine.good(noise, least, sigmas)]
+    phases = fine.judged(noise, least, sigmas).phases
     shifts = [s.shifts for s in light.harmonics]
     periods = [along / s.frequency for s in light.harmonics]
     found = ripples(ladder, remainders_of(ladder, phases, centre), phases, shifts, periods)

@@ -69,7 +69,11 @@ class Sample:
                 levels and over its noise.
         """
         if self.freedom:
-            return fit_noise(self.mean[self.usable], self.residual[self.usable], self.freedom, self.max_value)
+            mean, residual = self.mean.reshape(-1), self.residual.reshape(-1)
+            if not self.usable.all():
+                usable = np.flatnonzero(self.usable)
+                mean, residual = mean.take(usable), residual.take(usable)
+            return fit_noise(mean, residual, self.freedom, self.max_value)
         good = self.good(default_noise(self.max_value), least, sigmas)
         pair = good[:, :-PAIR_DISTANCE] & good[:, PAIR_DISTANCE:]
         pixels = slice(None, -PAIR_DISTANCE), slice(PAIR_DISTANCE, None)
@@ -79,24 +83,21 @@ class Sample:
         level = (self.mean[:, pixels[0]][pair] + self.mean[:, pixels[1]][pair]) * np.float32(0.5)
         return noise_of_pairs(ladder, phases, per_variance, level, centre, self.max_value)
 
-    def agreement(
-        self, ladder: Ladder, noise: NoiseModel, centre: float, least: float, sigmas: float, floor_cycles: float
-    ) -> list[Remainder]:
-        """How well the ladder's rungs agree where there is enough modulation."""
-        good = self.good(noise, least, sigmas)
-        cycles2 = self._noise_of_b2(noise)[:, good] / (self.modulations[:, good] ** 2 * np.float32(4 * np.pi**2))
-        return agreement(ladder, self.phases[:, good], cycles2, centre, floor_cycles)
-
-    def phase_sigma(self, noise: NoiseModel, finest: int, least: float, sigmas: float) -> float:
-        """Random 1-sigma of the finest set's phase, cycles, median of usable pixels; NaN without any."""
-        good = self.good(noise, least, sigmas)
-        cycles2 = self._noise_of_b2(noise)[finest][good] / (self.modulations[finest][good] ** 2 * 4 * np.pi**2)
-        return float(np.sqrt(np.median(cycles2))) if cycles2.size else float("nan")
+    def judged(self, noise: NoiseModel, least: float, sigmas: float) -> Judged:
+        """The `good` ones."""
+        enough, cycles2, modulations2 = self._enough(noise, least, sigmas)
+        sets = len(self.gains)
+        phases = self.phases.reshape(sets, -1)
+        cycles2 /= modulations2
+        good = np.flatnonzero(enough)
+        cycles2 = cycles2.reshape(sets, -1)
+        if good.size < enough.size:
+            phases, cycles2 = phases.take(good, axis=1), cycles2.take(good, axis=1)
+        return Judged(phases, cycles2)
 
     def good(self, noise: NoiseModel, least: float, sigmas: float) -> NDArray[np.bool_]:
         """(R, L) bool: pixels not clipped whose sets all have `least` modulation, and `sigmas` times its noise."""
-        enough = np.maximum(np.float32(sigmas**2) * self._noise_of_b2(noise), np.float32(max(least**2, 1e-12)))
-        return np.asarray((self.modulations**2 > enough).all(axis=0) & self.usable)
+        return self._enough(noise, least, sigmas)[0]
 
     def overtone_share2(self, finest: int) -> float:
         """Mean square that overtones leave at the worst phase, over the finest set's B^2 of a typical pixel."""
@@ -111,11 +112,37 @@ class Sample:
         enough = np.maximum(np.float32(sigmas**2) * noise, np.float32(max(least**2, 1e-12)))
         return np.asarray((self.modulations**2 > enough).all(axis=0) & self.usable)
 
-    def _noise_of_b2(self, noise: NoiseModel) -> NDArray[np.float32]:
-        # The plain form of what the kernel does.
+    def _enough(
+        self, noise: NoiseModel, least: float, sigmas: float
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
+        # Which are good; variance of B over (2 pi)^2, and B^2. The plain form of what the kernel does.
         model = noise.variance(self.mean)
         own = (np.float32(self.prior) * model + self.residual) / np.float32(self.prior + self.freedom)
-        return np.asarray(self.gains[:, None, None] * np.maximum(own, model), dtype=np.float32)
+        variance = self.gains[:, None, None] * np.maximum(own, model, out=own)
+        modulations2 = self.modulations * self.modulations
+        enough = np.maximum(np.float32(sigmas**2) * variance, np.float32(max(least**2, 1e-12)))
+        good = (modulations2 > enough).all(axis=0) & self.usable
+        variance *= np.float32(1 / (4 * np.pi**2))
+        return np.asarray(good), np.asarray(variance, np.float32), modulations2
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Pixels of a sample that are good. phases: (K, n) float32, cycles. cycles2: (K, n) float32, their variances."""
+
+    phases: NDArray[np.float32]
+    cycles2: NDArray[np.float32]
+
+    def agreement(self, ladder: Ladder, centre: float, floor_cycles: float) -> list[Remainder]:
+        """How well the ladder's rungs agree."""
+        return agreement(ladder, self.phases, self.cycles2, centre, floor_cycles)
+
+    def phase_sigma(self, finest: int) -> float:
+        """Random 1-sigma of the finest set's phase, cycles, median; NaN without any."""
+        if not self.cycles2.size:
+            return float("nan")
+        of_set = self.cycles2[finest]
+        return float(np.sqrt(np.partition(of_set, of_set.size // 2)[of_set.size // 2]))
 
 
 def take_sample(frames: AxisFrames, pixels: int, max_value: int, clip: int, least: float) -> Sample:

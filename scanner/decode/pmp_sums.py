@@ -19,6 +19,7 @@ from scanner.lanes import (
     LANES,
     Lanes,
     choose,
+    expect,
     floats,
     greatest,
     least,
@@ -88,6 +89,10 @@ def fit_runs(
     spot = aligned_rows(2 * sets + 3, LANES).reshape(-1)
     spare = np.zeros((addresses.size, LANES), like.dtype)
     for r in range(runs.size):
+        if r + 1 < runs.size:
+            for n in range(addresses.size):
+                expect(addresses, n, runs[r + 1], like)
+                expect(addresses, n, runs[r + 1] + length - 1, like)
         for done in range(0, length, LANES):
             at, size = runs[r] + done, min(LANES, length - done)
             # The last vector may end with the frame, but not lie beyond it.

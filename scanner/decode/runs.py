@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,8 +22,12 @@ def runs_of(pixels: int, size: int) -> tuple[NDArray[np.intp], int]:
     return spread_runs(pixels, size, RUN)
 
 
+@lru_cache(maxsize=16)
 def spread_runs(pixels: int, size: int, run: int) -> tuple[NDArray[np.intp], int]:
-    """The same with runs of another length: short ones are many, and see more phases of fringes that run along rows."""
+    """The same with runs of another length: short ones are many, and see more phases of fringes that run along rows.
+
+    The same array each time: not to be written into.
+    """
     length = min(run, pixels)
     if size * 2 >= pixels:
         return np.arange(0, pixels - length + 1, length, dtype=np.intp), length

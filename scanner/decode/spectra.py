@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode.addresses import pixels_at
-from scanner.kernel import contracting_kernel
+from scanner.kernel import summing_kernel
 
 ORDERS = 4
 """The highest order that is looked at: gamma 2.2 gives the fifth overtone a hundredth of the second's height."""
@@ -24,7 +24,7 @@ SUMS = 10
 squares and products of the parts of conj(b); of h and of b over the pixel's level."""
 
 
-@contracting_kernel
+@summing_kernel
 def sum_spectra(
     addresses: NDArray[np.intp],
     like: NDArray[Any],
@@ -50,45 +50,94 @@ def sum_spectra(
     """
     orders, shifts = weights.shape[0], addresses.size
     total = 0.0
+    grey, rows = np.empty((shifts, length)), np.empty((9, length))
+    count, share, real, imaginary = rows[0], rows[1], rows[2], rows[3]
+    unit_real, unit_imaginary, meant_real, meant_imaginary, before = rows[4], rows[5], rows[6], rows[7], rows[8]
     for r in range(0, runs.size, every):
+        for n in range(shifts):
+            samples = pixels_at(addresses[n], runs[r], length, like)
+            for i in range(length):
+                grey[n, i] = samples[i]
         for i in range(length):
-            if not good[r, i]:
-                continue
-            share = 1.0 / max(np.float64(level[r, i]), 1e-3)
-            mean = 0.0
-            for n in range(shifts):
-                mean += np.float64(pixels_at(addresses[n], runs[r] + i, 1, like)[0])
-            total += mean / shifts * share
-            unit_real, unit_imaginary = 1.0, 0.0
-            meant_real, meant_imaginary = 0.0, 0.0
-            for m in range(orders):
-                real, imaginary = 0.0, 0.0
-                for n in range(shifts):
-                    sample = np.float64(pixels_at(addresses[n], runs[r] + i, 1, like)[0])
-                    real += weights[m, 0, n] * sample
-                    imaginary += weights[m, 1, n] * sample
+            # Others are counted as nothing: all pixels of a run go through the same vectors.
+            count[i] = 1.0 if good[r, i] else 0.0
+            share[i] = count[i] / max(np.float64(level[r, i]), 1e-3)
+        for n in range(shifts):
+            for i in range(length):
+                total += grey[n, i] * share[i] / shifts
+        for m in range(orders):
+            _height(grey, weights[m], length, real, imaginary)
+            for i in range(length):
                 if m == 0:
-                    height = np.sqrt(real * real + imaginary * imaginary) + 1e-12
-                    unit_real, unit_imaginary = real / height, imaginary / height
-                    meant_real, meant_imaginary = real, imaginary
+                    height = np.sqrt(real[i] * real[i] + imaginary[i] * imaginary[i]) + 1e-12
+                    unit_real[i], unit_imaginary[i] = real[i] / height, imaginary[i] / height
+                    meant_real[i], meant_imaginary[i] = real[i], imaginary[i]
                 else:
-                    meant_real, meant_imaginary = (
-                        meant_real * unit_real - meant_imaginary * unit_imaginary,
-                        meant_real * unit_imaginary + meant_imaginary * unit_real,
-                    )
-                row = sums[m + 1]
-                row[POWER] += meant_real * meant_real + meant_imaginary * meant_imaginary
-                if m + 1 == folded:
-                    row[REAL] += meant_real * real
-                    row[IMAGINARY] -= meant_imaginary * real
-                    row[AA] += meant_real * meant_real
-                    row[AB] -= meant_real * meant_imaginary
-                    row[BB] += meant_imaginary * meant_imaginary
-                else:
-                    row[REAL] += meant_real * real + meant_imaginary * imaginary
-                    row[IMAGINARY] += meant_real * imaginary - meant_imaginary * real
-                row[SEEN_REAL] += real * share
-                row[SEEN_IMAGINARY] += imaginary * share
-                row[MEANT_REAL] += meant_real * share
-                row[MEANT_IMAGINARY] += meant_imaginary * share
+                    before[i] = meant_real[i]
+                    meant_real[i] = meant_real[i] * unit_real[i] - meant_imaginary[i] * unit_imaginary[i]
+                    meant_imaginary[i] = before[i] * unit_imaginary[i] + meant_imaginary[i] * unit_real[i]
+            _add(sums[m + 1], m + 1 == folded, length, count, share, real, imaginary, meant_real, meant_imaginary)
     return total
+
+
+@summing_kernel
+def _height(
+    grey: NDArray[np.float64],
+    weights: NDArray[np.float32],
+    length: int,
+    real: NDArray[np.float64],
+    imaginary: NDArray[np.float64],
+) -> None:
+    """One order's, of each pixel of a run."""
+    for i in range(length):
+        real[i], imaginary[i] = 0.0, 0.0
+    for n in range(grey.shape[0]):
+        to_real, to_imaginary = np.float64(weights[0, n]), np.float64(weights[1, n])
+        for i in range(length):
+            real[i] += to_real * grey[n, i]
+            imaginary[i] += to_imaginary * grey[n, i]
+
+
+@summing_kernel
+def _add(
+    row: NDArray[np.float64],
+    folded: bool,
+    length: int,
+    count: NDArray[np.float64],
+    share: NDArray[np.float64],
+    real: NDArray[np.float64],
+    imaginary: NDArray[np.float64],
+    meant_real: NDArray[np.float64],
+    meant_imaginary: NDArray[np.float64],
+) -> None:
+    """One order of one run."""
+    rr, ri, ir, ii = 0.0, 0.0, 0.0, 0.0
+    aa, ab, bb = 0.0, 0.0, 0.0
+    seen_real, seen_imaginary, there_real, there_imaginary = 0.0, 0.0, 0.0, 0.0
+    for i in range(length):
+        a, b = meant_real[i] * count[i], meant_imaginary[i] * count[i]
+        rr += a * real[i]
+        ri += a * imaginary[i]
+        ir += b * real[i]
+        ii += b * imaginary[i]
+        aa += a * meant_real[i]
+        ab += a * meant_imaginary[i]
+        bb += b * meant_imaginary[i]
+        seen_real += real[i] * share[i]
+        seen_imaginary += imaginary[i] * share[i]
+        there_real += meant_real[i] * share[i]
+        there_imaginary += meant_imaginary[i] * share[i]
+    row[POWER] += aa + bb
+    if folded:
+        row[REAL] += rr
+        row[IMAGINARY] -= ir
+        row[AA] += aa
+        row[AB] -= ab
+        row[BB] += bb
+    else:
+        row[REAL] += rr + ii
+        row[IMAGINARY] += ri - ir
+    row[SEEN_REAL] += seen_real
+    row[SEEN_IMAGINARY] += seen_imaginary
+    row[MEANT_REAL] += there_real
+    row[MEANT_IMAGINARY] += there_imaginary

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import TypeVar
 
 import numba
@@ -36,6 +38,16 @@ def in_strips(work: Callable[[int, int], _T], pixels: int, threads: int) -> list
     def share() -> list[_T]:
         return [work(begin, min(begin + length, pixels)) for begin in begins]
 
-    with ThreadPoolExecutor(threads - 1) as pool:
-        others = [pool.submit(share) for _ in range(threads - 1)]
-        return share() + [result for other in others for result in other.result()]
+    others = [_crew().submit(share) for _ in range(threads - 1)]
+    found = share()
+    # One that has not begun is not waited for: its strips are done, and those before it may wait for this one.
+    return found + [result for other in others if not other.cancel() for result in other.result()]
+
+
+@cache
+def _crew() -> ThreadPoolExecutor:
+    """Threads that stay: to start and to end one takes as long as a twentieth of an image."""
+    return ThreadPoolExecutor(MAX_THREADS - 1, thread_name_prefix="strips")
+
+
+os.register_at_fork(after_in_child=_crew.cache_clear)

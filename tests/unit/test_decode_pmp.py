@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import numpy as np
@@ -474,6 +475,15 @@ def test_strips_cover_every_pixel_once():
         assert strips[-1][1] == pixels
         assert all(before[1] == after[0] for before, after in pairwise(strips))
         assert all(begin % MIN_STRIP == 0 for begin, _ in strips)
+
+
+def test_strips_within_strips_wait_for_nobody():
+    def work(begin, end):
+        return sum(end - begin for begin, end in in_strips(lambda begin, end: (begin, end), end - begin, 4))
+
+    with ThreadPoolExecutor(6) as pool:
+        totals = list(pool.map(lambda _: sum(in_strips(work, 60 * MIN_STRIP, 4)), range(6)))
+    assert totals == [60 * MIN_STRIP] * 6
 
 
 def test_the_arctangent_is_as_good_as_it_says():
