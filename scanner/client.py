@@ -298,7 +298,8 @@ class Client:
         outcome: Any = None
         try:
             while True:
-                outcome = self._exchange(procedure.send(outcome))
+                wanted = procedure.send(outcome)
+                outcome = self._exchange(wanted) if isinstance(wanted, Call) else self._exchange_all(wanted)
         except StopIteration as stop:
             result: _T = stop.value
             return result
@@ -327,6 +328,23 @@ class Client:
                 raise outcome
             return outcome
         raise unreachable(self.endpoint, f"{call.method} was not answered within {self.timeout_s:g} s")
+
+    def _exchange_all(self, calls: tuple[Call, ...]) -> list[Any]:
+        """Several calls at once: while one answer is on its way the next is being made."""
+        asked: dict[int | str | None, int] = {}
+        results: dict[int, Any] = {}
+        for index, call in enumerate(calls):
+            number, data = self._session.request(call)
+            asked[number] = index
+            send(self._control, data)
+        while len(results) < len(calls) and self._control.poll(int(RESEND_S * 1e3)):
+            found, outcome = self._session.answer_in_place(self._control.recv(copy=False).buffer)
+            if isinstance(outcome, ScannerError) and not hello_required(outcome):
+                raise outcome
+            if found in asked and not isinstance(outcome, ScannerError):
+                results[asked[found]] = outcome
+        # What was not answered, or not known to whom, once more by itself.
+        return [results[n] if n in results else self._exchange(call) for n, call in enumerate(calls)]
 
     def _subscribe(self) -> None:
         if self._events is not None:

@@ -247,7 +247,11 @@ class AsyncClient:
         outcome: Any = None
         try:
             while True:
-                outcome = await self._exchange(procedure.send(outcome))
+                wanted = procedure.send(outcome)
+                if isinstance(wanted, Call):
+                    outcome = await self._exchange(wanted)
+                else:
+                    outcome = await asyncio.gather(*(self._exchange(call) for call in wanted))
         except StopIteration as stop:
             result: _T = stop.value
             return result

@@ -12,6 +12,9 @@ from scanner.errors import ProtocolError
 from scanner.session import Call, Procedure
 from scanner.wire import MAX_FETCH_BYTES, ArrayEntry, Event
 
+AT_ONCE = 8
+"""Pieces that are asked for together: 32 MiB on their way, the points of a megapixel"""
+
 
 def fetch_arrays(event: Event) -> Procedure[dict[str, NDArray[Any]]]:
     """The arrays that a `points` event names, by name: xyz and confidence, as scan.npz will have them.
@@ -29,12 +32,21 @@ def fetch_arrays(event: Event) -> Procedure[dict[str, NDArray[Any]]]:
         array = arrays[entry.name]
         if array.dtype.hasobject or array.nbytes != entry.bytes:
             raise ProtocolError(f"{entry.name}: {entry.dtype} {entry.shape} are not {entry.bytes} bytes")
-        into = array.reshape(-1).view(np.uint8).data
-        for first in range(0, entry.bytes, MAX_FETCH_BYTES):
-            length = min(MAX_FETCH_BYTES, entry.bytes - first)
-            place = {"id": event.job, "name": name, "offset": entry.offset + first, "length": length}
-            piece = yield Call("scan.fetch", place)
-            if not isinstance(piece, bytes) or len(piece) != length:
-                raise ProtocolError(f"scan.fetch of {entry.name} at {first} gave not {length} bytes")
-            into[first : first + length] = piece
+    pieces = [
+        piece for entry in entries for piece in _pieces(entry, arrays[entry.name].reshape(-1).view(np.uint8).data)
+    ]
+    for first in range(0, len(pieces), AT_ONCE):
+        now = pieces[first : first + AT_ONCE]
+        place = {"id": event.job, "name": name}
+        got = yield tuple(Call("scan.fetch", {**place, "offset": at, "length": len(into)}) for at, into in now)
+        for (at, into), piece in zip(now, got, strict=True):
+            if not isinstance(piece, bytes | memoryview) or len(piece) != len(into):
+                raise ProtocolError(f"scan.fetch of {name} at {at} gave not {len(into)} bytes")
+            into[:] = piece
     return arrays
+
+
+def _pieces(entry: ArrayEntry, into: memoryview) -> list[tuple[int, memoryview]]:
+    """(offset in the file, where to) of an array's pieces."""
+    firsts = range(0, entry.bytes, MAX_FETCH_BYTES)
+    return [(entry.offset + first, into[first : first + MAX_FETCH_BYTES]) for first in firsts]

@@ -30,6 +30,7 @@ from scanner.wire import (
     Request,
     decode_event,
     decode_response,
+    decoded,
     encode_request,
     error_from_body,
     ipc_path,
@@ -61,7 +62,22 @@ class Call:
 
 
 _T = TypeVar("_T")
-Procedure = Generator[Call, Any, _T]
+Procedure = Generator[Call | tuple[Call, ...], Any, _T]
+"""Yields calls, one after another, and takes their results. Of a tuple, which are made at once, it takes a list of
+results in their order; results that are bytes are then views."""
+
+
+class _Raw(msgspec.Struct):
+    """An answer whose result is not decoded yet."""
+
+    id: int | str | None
+    result: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+    error: ErrorBody | msgspec.UnsetType = msgspec.UNSET
+
+
+_raw_answers: msgspec.msgpack.Decoder[_Raw] = msgspec.msgpack.Decoder(_Raw)
+_BYTES_HEAD = {0xC4: 2, 0xC5: 3, 0xC6: 5}
+"""MessagePack: first byte of bytes with a length of 8, 16, 32 bits, and how many bytes come before them"""
 
 
 class Session:
@@ -95,6 +111,23 @@ class Session:
         if isinstance(response.error, ErrorBody):
             return response.id, error_from_body(response.error)
         return response.id, None if response.result is msgspec.UNSET else response.result
+
+    @staticmethod
+    def answer_in_place(data: memoryview) -> tuple[int | str | None, Any]:
+        """`answer`, where a result that is bytes is a view of `data`, not a copy.
+
+        Raises:
+            ProtocolError: it is none.
+        """
+        response = decoded(_raw_answers, data, "an answer")
+        if isinstance(response.error, ErrorBody):
+            return response.id, error_from_body(response.error)
+        if response.result is msgspec.UNSET:
+            return response.id, None
+        result = memoryview(response.result)
+        if (head := _BYTES_HEAD.get(result[0])) is not None:
+            return response.id, result[head:]
+        return response.id, msgspec.msgpack.decode(result)
 
     @staticmethod
     def check_welcome(welcome: Mapping[str, Any]) -> dict[str, Any]:

@@ -301,6 +301,20 @@ def decoded(decoder: msgspec.msgpack.Decoder[_T], data: bytes | memoryview, what
         raise ProtocolError(f"not {what}: {error}") from error
 
 
+LARGE_BYTES = 1 << 16
+"""Bytes that are not copied where that can be helped"""
+
+
+def answer_head(number: int | str | None, length: int) -> bytes:
+    """What comes before `length` bytes, `LARGE_BYTES` or more, that are the result of an answer, in the answer's bytes.
+
+    Together they are what `encode` makes of the whole, but the bytes need not be copied for it.
+    """
+    if not LARGE_BYTES <= length < 1 << 32:
+        raise ValueError(f"{length} bytes have another head")
+    return encode(Response(id=number, result=b""))[:-2] + b"\xc6" + length.to_bytes(4, "big")
+
+
 def decode_response(data: bytes) -> Response:
     """Read an answer.
 

@@ -6,16 +6,17 @@ import asyncio
 import logging
 import os
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable, Mapping
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 from scanner.errors import DeviceBusy, ScannerError, StorageError
 from scanner.storage import temporary_of
 from scanner.wire import (
+    LARGE_BYTES,
     MAX_FETCH_BYTES,
     MAX_MESSAGE_BYTES,
     MAX_REQUEST_BYTES,
@@ -31,6 +32,7 @@ from scanner.wire import (
     Request,
     Response,
     ScanStart,
+    answer_head,
     decode_request,
     encode,
     error_body,
@@ -117,7 +119,8 @@ class Control:
         number = request_id(body[0]) if len(body) == 1 else None
         try:
             request = decode_request(_only_part(body))
-            return encode(Response(id=request.id, result=await self.answer(identity, request)))
+            result = await self.answer(identity, request)
+            return result.data if isinstance(result, _Encoded) else encode(Response(id=request.id, result=result))
         except ScannerError as error:
             return encode(Response(id=number, error=error_body(error)))
         except Exception as error:  # noqa: BLE001  (one call that fails must not end the daemon)
@@ -246,7 +249,7 @@ class Control:
             self._pipeline.spool.lease(job.id)
         return job.result()
 
-    async def _fetch(self, request: Request, _client: str) -> bytes:
+    async def _fetch(self, request: Request, _client: str) -> bytes | _Encoded:
         given = params_as(Fetch, request)
         job = self._pipeline.store.get(given.id)
         size = None if job.deleted else job.readable(given.name)
@@ -267,7 +270,9 @@ class Control:
         folder = self._pipeline.spool.folder(job.id)
         inside, _, name = given.name.rpartition("/")
         path = (folder / inside if inside else folder / (job.output or "")) / name
-        return await asyncio.to_thread(_piece, path, given.offset, length)
+        if length < LARGE_BYTES:
+            return await asyncio.to_thread(_piece, path, given.offset, length)
+        return await asyncio.to_thread(_large_piece, request.id, path, given.offset, length)
 
     async def _cancel(self, request: Request, _client: str) -> dict[str, Any]:
         job = self._job(request)
@@ -351,19 +356,44 @@ def _only_part(body: list[bytes]) -> bytes:
     return body[0]
 
 
+@dataclass(frozen=True)
+class _Encoded:
+    """A result that stands in its answer's bytes already."""
+
+    data: bytes
+
+
 def _piece(path: Path, offset: int, length: int) -> bytes:
+    with _opened(path) as file:
+        return os.pread(file.fileno(), length, offset)
+
+
+def _large_piece(number: int | str | None, path: Path, offset: int, length: int) -> _Encoded | bytes:
+    """The answer, read into its own bytes; of a file that is shorter than it was the bytes that there are."""
+    head = answer_head(number, length)
+    answer = bytearray(len(head) + length)
+    answer[: len(head)] = head
+    with _opened(path) as file:
+        got = os.preadv(file.fileno(), [memoryview(answer)[len(head) :]], offset)
+    # A bytearray, of which a socket takes the bytes like those of any other.
+    return _Encoded(cast(bytes, answer)) if got == length else bytes(answer[len(head) : len(head) + got])
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    """A file, or its bytes so far where it is not whole yet; it may become that meanwhile."""
     try:
-        with _opened(path) as file:
-            return os.pread(file.fileno(), length, offset)
+        for place in (path, temporary_of(path), path):
+            try:
+                file = place.open("rb", buffering=0)
+            except FileNotFoundError as error:
+                missing = error
+                continue
+            with file:
+                yield file
+            return
+        raise missing
     except OSError as error:
         raise StorageError(
             f"{path.name} cannot be read: {error.strerror}", hint="was the spool changed by hand?"
         ) from error
-
-
-def _opened(path: Path) -> BinaryIO:
-    """A file, or its bytes so far where it is not whole yet; it may become that meanwhile."""
-    for place in (path, temporary_of(path)):
-        with suppress(FileNotFoundError):
-            return place.open("rb", buffering=0)
-    return path.open("rb", buffering=0)

@@ -17,7 +17,7 @@ import zmq.asyncio
 
 from scanner.errors import ConfigError, StorageError
 from scanner.storage import storage_errors
-from scanner.wire import MAX_MESSAGE_BYTES, WELCOME, ipc_path
+from scanner.wire import LARGE_BYTES, MAX_MESSAGE_BYTES, WELCOME, ipc_path
 
 HIGH_WATER = 10_000
 """Messages that wait for one peer; more are refused (ROUTER) or dropped (events), never waited for."""
@@ -132,7 +132,8 @@ def send_now(to: zmq.asyncio.Socket, parts: Sequence[bytes]) -> bool:
 def try_send(to: zmq.asyncio.Socket, parts: Sequence[bytes]) -> Sent:
     """Send without waiting."""
     # With DONTWAIT the future is done when it is returned.
-    sent = cast("asyncio.Future[None]", to.send_multipart(parts, zmq.DONTWAIT))
+    copy = len(parts[-1]) < LARGE_BYTES
+    sent = cast("asyncio.Future[None]", to.send_multipart(parts, zmq.DONTWAIT, copy=copy))
     error = sent.exception()
     if error is None:
         return Sent.DONE

@@ -146,6 +146,30 @@ def test_errors_keep_class_hint_and_details(error: ScannerError) -> None:
     assert getattr(found, "reason", None) == getattr(error, "reason", None)
 
 
+@pytest.mark.parametrize("length", [wire.LARGE_BYTES, wire.LARGE_BYTES + 1, 4 << 20])
+@pytest.mark.parametrize("number", [7, "seven", None])
+def test_an_answer_of_many_bytes_is_read_in_place(number: int | str | None, length: int) -> None:
+    content = bytes(length)
+    data = wire.answer_head(number, length) + content
+    assert data == wire.encode(Response(id=number, result=content))
+    found, result = Session.answer_in_place(memoryview(data))
+    assert (found, result) == (number, content)
+    assert isinstance(result, memoryview)
+    with pytest.raises(ValueError, match="another head"):
+        wire.answer_head(number, wire.LARGE_BYTES - 1)
+
+
+def test_other_answers_are_read_in_place_as_ever() -> None:
+    refused = Response(id=1, error=wire.error_body(Refused("no", reason="unknown_file")))
+    for response in (Response(id=1, result={"a": [1, 2]}), Response(id=1), Response(id=1, result=b"few"), refused):
+        data = wire.encode(response)
+        (a, b), (c, d) = Session.answer(data), Session.answer_in_place(memoryview(data))
+        assert a == c
+        assert repr(b) == repr(d) or b == d
+    with pytest.raises(ProtocolError):
+        Session.answer_in_place(memoryview(b"\xc1"))
+
+
 @pytest.mark.parametrize("endpoint", ["tcp://127.0.0.1:5555", "ipc://relative", "ipc:///" + 120 * "x", "inproc://a"])
 def test_endpoints_that_are_not_served(endpoint: str) -> None:
     with pytest.raises(Refused):
