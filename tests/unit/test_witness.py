@@ -164,6 +164,17 @@ def test_swapped_and_doubled_frames_are_named() -> None:
     assert questioned(capture, {5: 14, 14: 5}).suspects == (5, 14)
 
 
+def test_a_shadow_over_one_frame_is_named_though_no_order_explains_it() -> None:
+    capture = taken("8 shifts")
+    position = capture.sequence.fringes[-3]
+    shown = reordered(capture, {})
+    frame = shown[position]
+    shown[position] = (frame * np.linspace(1, 0.6, frame.shape[1])).astype(frame.dtype)
+    found = witness(capture.sequence, shown, capture.format.max_value)
+    assert [item.name for item in found.items if not item.passed] == ["residual 8y"]
+    assert found.suspects == (position,)
+
+
 def test_a_rotated_set_is_named_and_the_blind_rotation_needs_the_bars() -> None:
     capture = taken("4 shifts")
     middle = sets(capture.sequence)[1]
