@@ -66,7 +66,7 @@ def choose_mcp(projector: ProjectorSize, axis: Axis, camera_scale: tuple[float, 
     problem: DecodeError | None = None
     for fewer in range(bits, FEWEST_BITS - 1, -1):
         try:
-            pattern = McpPattern(axis, fewer, _carriers(finest, fewer), _codes(fewer))
+            pattern = McpPattern(axis, fewer, _carriers(finest, fewer), codes_of(fewer))
             pattern.validate(projector)
         except DecodeError as error:
             problem = error
@@ -84,6 +84,11 @@ def choose_mcp(projector: ProjectorSize, axis: Axis, camera_scale: tuple[float, 
         f"{scale_across:.2f} camera pixels, is too coarse for mcp" + (f": {problem}" if problem else ""),
         hint="move the camera nearer, take a camera of more pixels, or use pmp",
     )
+
+
+def codes_of(bits: int) -> tuple[int, ...]:
+    """The default order of the code words: neighbours far apart where an order is known, else the natural one."""
+    return PERMUTED_CODES if bits == MOST_BITS else tuple(range(1 << bits))
 
 
 def _finest(across: int, scale: float, why: dict[str, str]) -> float:
@@ -112,10 +117,6 @@ def _bits(along: int, scale: float, why: dict[str, str]) -> int:
 def _carriers(finest: float, bits: int) -> tuple[float, ...]:
     # A carrier that is whole but for the last digit of a float is whole.
     return tuple(float(math.floor(finest * ratio + 1e-6)) for ratio in RATIOS[-bits:])
-
-
-def _codes(bits: int) -> tuple[int, ...]:
-    return PERMUTED_CODES if bits == MOST_BITS else tuple(range(1 << bits))
 
 
 def _gap(pattern: McpPattern) -> float:

@@ -17,17 +17,20 @@ from service.commands.options import (
     Bits,
     Box,
     Carriers,
+    Codes,
     Connect,
     DecoderName,
     Depth,
     EdgeFilter,
     Exposure,
+    First,
     Force,
     Levels,
     Method,
     MinConfidence,
     PatternOptions,
     Profile,
+    Unmodulated,
     filter_members,
     output_path,
 )
@@ -79,6 +82,9 @@ def live(
     carriers: Carriers = None,
     profile: Profile = None,
     levels: Levels = None,
+    codes: Codes = None,
+    first: First = None,
+    unmodulated: Unmodulated = None,
     depth: Depth = None,
     box: Box = None,
     min_confidence: MinConfidence = None,
@@ -111,7 +117,8 @@ def live(
         from scanner.storage import try_file  # noqa: PLC0415
 
         try_file(picture)
-    members = PatternOptions(None, None, axis, bits, carriers, profile, levels).members(Method.MCP)
+    said = PatternOptions(None, None, axis, bits, carriers, profile, levels, None, codes, first, unmodulated)
+    members = said.members(Method.MCP)
     params: dict[str, Any] = {
         "pattern": members or None,
         "exposure": None if exposure is None else exposure_given(exposure),

@@ -6,6 +6,7 @@ They end as plain data, in the words of formats.md; numbers out of bounds and co
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from scanner.errors import ConfigError
+from service.terminal import print_error
 
 
 def output_path(text: str) -> Path:
@@ -105,12 +107,40 @@ Levels = Annotated[
     str | None,
     typer.Option(metavar="equal|composite", help="MCP: stripes equally bright, or as published. Default: equal."),
 ]
-
+Codes = Annotated[
+    str | None,
+    typer.Option(
+        metavar="N,N,...",
+        help="MCP: code word of each modulated stripe, 0 .. 2^bits - 1 once each. Default: neighbours differ in two "
+        "bits or more (4 bits); 0,1,2,... (others).",
+    ),
+]
+First = Annotated[
+    str | None,
+    typer.Option(metavar="modulated|unmodulated", help="MCP: kind of the first stripe. Default: modulated."),
+]
+Unmodulated = Annotated[
+    float | None,
+    typer.Option(
+        metavar="L",
+        help="MCP with --levels composite: light of unmodulated stripes, above 0 and at most 1. Default: 1.",
+    ),
+]
+Code = Annotated[
+    str | None, typer.Option(metavar="gray|binary", help="gray, gray+pmp: how positions are coded. Default: gray.")
+]
+Inverse = Annotated[
+    bool | None,
+    typer.Option(
+        "--inverse/--no-inverse",
+        help="gray, gray+pmp: after each code image its inverse, or not. Default: with them (gray+pmp: without).",
+    ),
+]
 White = Annotated[
     bool,
     typer.Option(
         "--white",
-        help="MCP: full on and off too, for still, textured scenes: 9 frames with those that prove their order.",
+        help="MCP: full on and off too, for still, textured scenes; a scan then has 9 frames, some to prove the order.",
     ),
 ]
 
@@ -127,40 +157,52 @@ class PatternOptions:
     profile: str | None = None
     levels: str | None = None
     white: bool | None = None
+    codes: str | None = None
+    first: str | None = None
+    unmodulated: float | None = None
+    code: str | None = None
+    inverse: bool | None = None
 
     def members(self, method: Method) -> dict[str, Any]:
-        """Members of the pattern's description that were said.
+        """Members of the pattern's description that were said. What follows from them unasked is told, as a note.
 
         Raises:
             typer.BadParameter: not of its form, or not of this method.
         """
-        allowed = {
-            Method.PMP: {"frequencies", "shifts", "axis"},
-            Method.MCP: {"axis", "bits", "carriers", "profile", "levels", "white"},
-            Method.GRAY: {"axis", "bits"},
-            Method.CP: {"axis", "carriers"},
-            Method.GRAY_PMP: {"frequencies", "shifts", "axis", "bits"},
-        }[method]
         given = {name: value for name, value in vars(self).items() if value is not None}
-        for name in given.keys() - allowed:
-            raise typer.BadParameter(f"--{name} says nothing to the method {method}")
+        for name in given.keys() - _OF_METHOD[method]:
+            option = "inverse/--no-inverse" if name == "inverse" else name
+            raise typer.BadParameter(f"--{option} says nothing to the method {method}")
         members: dict[str, Any] = {
-            name: _choice(given[name], name, choices)
-            for name, choices in (("profile", ("triangle", "cosine")), ("levels", ("equal", "composite")))
-            if name in given
+            name: given[name] for name in ("bits", "inverse", "unmodulated", "white") if name in given
         }
-        if "white" in given:
-            members["white"] = True
+        members |= {name: _choice(given[name], name, choices) for name, choices in _CHOICES.items() if name in given}
         if "axis" in given:
             members |= _axes(given["axis"], method)
-        if "bits" in given:
-            members["bits"] = given["bits"]
         for name in ("frequencies", "carriers"):
             if name in given:
                 members[name] = numbers(given[name], f"--{name}")
-        if "shifts" in given:
-            members["shifts"] = _whole_numbers(given["shifts"], "--shifts")
+        for name, least in (("shifts", 1), ("codes", 0)):
+            if name in given:
+                members[name] = _whole_numbers(given[name], f"--{name}", least)
         return _followed(members, method)
+
+
+_OF_METHOD: Mapping[Method, frozenset[str]] = {
+    Method.PMP: frozenset({"frequencies", "shifts", "axis"}),
+    Method.MCP: frozenset(
+        {"axis", "bits", "carriers", "profile", "levels", "white", "codes", "first", "unmodulated"},
+    ),
+    Method.GRAY: frozenset({"axis", "bits", "code", "inverse"}),
+    Method.CP: frozenset({"axis", "carriers"}),
+    Method.GRAY_PMP: frozenset({"frequencies", "shifts", "axis", "bits", "code", "inverse"}),
+}
+_CHOICES: Mapping[str, tuple[str, ...]] = {
+    "profile": ("triangle", "cosine"),
+    "levels": ("equal", "composite"),
+    "first": ("modulated", "unmodulated"),
+    "code": ("gray", "binary"),
+}
 
 
 def _followed(members: dict[str, Any], method: Method) -> dict[str, Any]:
@@ -179,12 +221,38 @@ def _followed(members: dict[str, Any], method: Method) -> dict[str, Any]:
         if len(shifts) not in (1, count):
             raise typer.BadParameter(f"--shifts: {len(shifts)} numbers for {count} frequencies; give 1 or {count}")
         return {**members, "shifts": shifts * count if len(shifts) == 1 else shifts}
-    if method == Method.MCP and ("carriers" in members or "bits" in members):
-        bits = members.get("bits", len(members.get("carriers", ())))
-        if len(members.get("carriers", ())) != bits:
-            raise typer.BadParameter(f"--bits {bits} needs --carriers with {bits} numbers, one a bit")
-        return {**members, "bits": bits, "codes": list(range(1 << bits))}
-    return members
+    return _followed_mcp(members) if method == Method.MCP else members
+
+
+def _followed_mcp(members: dict[str, Any]) -> dict[str, Any]:
+    light = members.get("unmodulated")
+    if light is not None and members.get("levels") != "composite":
+        raise typer.BadParameter("--unmodulated says nothing to stripes that are equally bright: --levels composite")
+    if light is not None and not 0 < light <= 1:
+        raise typer.BadParameter(f"--unmodulated: expected a number above 0 and at most 1, got {light:g}")
+    if "carriers" not in members and "bits" not in members:
+        return members
+    bits = members.get("bits", len(members.get("carriers", ())))
+    if len(members.get("carriers", ())) != bits:
+        raise typer.BadParameter(f"--bits {bits} needs --carriers with {bits} numbers, one a bit")
+    if not 2 <= bits <= 6:
+        raise typer.BadParameter(f"--carriers: MCP takes 2 to 6, got {bits}")
+    return {**members, "bits": bits, "codes": _codes(members, bits)}
+
+
+def _codes(members: Mapping[str, Any], bits: int) -> list[int]:
+    """The code words said, else the default order of that many bits, told where it is the natural one."""
+    from scanner.patterns.mcp_choice import codes_of  # noqa: PLC0415  (array libraries)
+
+    default = list(codes_of(bits))
+    said = members.get("codes")
+    if said is None:
+        if default == sorted(default):
+            print_error(f"code words of {bits} bits stand in natural order, 0,1,2,...", "--codes", label="note")
+        return default
+    if sorted(said) != sorted(default):
+        raise typer.BadParameter(f"--codes: {bits} carriers have the words 0 .. {len(default) - 1}, each once")
+    return list(said)
 
 
 def _axes(text: str, method: Method) -> dict[str, Any]:
@@ -211,11 +279,12 @@ def numbers(text: str, name: str) -> list[float]:
     return [int(value) if value == int(value) else value for value in values]
 
 
-def _whole_numbers(text: str, name: str) -> list[int]:
-    values = numbers(text, name)
-    if any(not isinstance(value, int) for value in values):
-        raise typer.BadParameter(f"{name}: expected whole numbers, got {text!r}")
-    return [int(value) for value in values]
+def _whole_numbers(text: str, name: str, least: int) -> list[int]:
+    words = [word.strip() for word in text.split(",")]
+    # Sixteen digits: no count of anything here has more, and int() of a million of them takes a while.
+    if any(not (word.isascii() and word.isdecimal() and len(word) <= 16 and int(word) >= least) for word in words):
+        raise typer.BadParameter(f"{name}: expected whole numbers from {least}, as 4,4,8, got {text!r:.80}")
+    return [int(word) for word in words]
 
 
 # --- filters ------------------------------------------------------------------------------------------------------

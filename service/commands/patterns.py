@@ -12,13 +12,19 @@ from service.commands.options import (
     AxisOption,
     Bits,
     Carriers,
+    Code,
+    Codes,
+    First,
     Force,
     Frequencies,
+    Inverse,
     Levels,
     Method,
     PatternOptions,
     Profile,
     Shifts,
+    Unmodulated,
+    White,
     output_path,
 )
 from service.terminal import print_facts, print_json, progress_lines
@@ -52,6 +58,12 @@ def patterns(
     carriers: Carriers = None,
     profile: Profile = None,
     levels: Levels = None,
+    codes: Codes = None,
+    first: First = None,
+    unmodulated: Unmodulated = None,
+    white: White = False,
+    code: Code = None,
+    inverse: Inverse = None,
     gamma: Annotated[
         float | None,
         typer.Option(
@@ -77,13 +89,28 @@ def patterns(
       fringed patterns pmp -o scans/pmp --size 1920x1080 --frequencies 1,8,64 --shifts 8 --axis x
       fringed patterns mcp -o scans/mcp --size 1152x864 --gamma 2.2
       fringed patterns mcp -o scans/mcp-bench --for simulated:bench2026     what a scan of that rig projects
-      fringed patterns gray -o scans/gray --bits 10
+      fringed patterns gray -o scans/gray --bits 10 --no-inverse     with full on and off, which it then needs
     """
     from scanner.errors import ScannerError  # noqa: PLC0415
     from scanner.storage import prepare_output, replace_json  # noqa: PLC0415
     from service.rig_patterns import known_rig  # noqa: PLC0415
 
-    members = PatternOptions(frequencies, shifts, axis, bits, carriers, profile, levels).members(method)
+    said = PatternOptions(
+        frequencies,
+        shifts,
+        axis,
+        bits,
+        carriers,
+        profile,
+        levels,
+        white or None,
+        codes,
+        first,
+        unmodulated,
+        code,
+        inverse,
+    )
+    members = said.members(method)
     if rig is not None and size is not None:
         raise typer.BadParameter("--size and --for exclude each other: the rig has a size")
     try:
@@ -131,16 +158,20 @@ def _sequence(
     method: Method, members: dict[str, Any], known: KnownRig, gamma: float | None, *, bracketed: bool
 ) -> PatternSequence:
     """The sequence to write: the method's images alone, or with those that a scan puts around them."""
-    from scanner.patterns import PatternSequence  # noqa: PLC0415
+    from scanner.patterns import GrayPattern, PatternSequence  # noqa: PLC0415
     from scanner.patterns.sequence import Precorrection  # noqa: PLC0415
     from service.scan_patterns import pattern_for  # noqa: PLC0415
 
     pattern = pattern_for(method.value, members, known.axis, known.projector, known.camera_scale)
     precorrection = known.precorrection if gamma is None else Precorrection(gamma=gamma)
+    white = members.get("white", False)
     if bracketed:
-        return PatternSequence.bracketed(known.projector, pattern, precorrection)
+        return PatternSequence.bracketed(known.projector, pattern, precorrection, white=white)
     pattern.validate(known.projector)
-    return PatternSequence(known.projector, pattern, precorrection=precorrection)
+    # A code without inverses is decided by full on and off.
+    beside = white or (isinstance(pattern, GrayPattern) and not pattern.inverse)
+    full, dark = (0, 1) if beside else (None, None)
+    return PatternSequence(known.projector, pattern, full, dark, precorrection=precorrection)
 
 
 def _reasons(known: KnownRig, method: Method, members: dict[str, Any], gamma: float | None) -> dict[str, str]:

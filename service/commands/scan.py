@@ -20,13 +20,17 @@ from service.commands.options import (
     Bits,
     Box,
     Carriers,
+    Code,
+    Codes,
     Connect,
     DecoderName,
     Depth,
     EdgeFilter,
     Exposure,
+    First,
     Force,
     Frequencies,
+    Inverse,
     Levels,
     Method,
     MinConfidence,
@@ -34,6 +38,7 @@ from service.commands.options import (
     PatternOptions,
     Profile,
     Shifts,
+    Unmodulated,
     White,
     filter_members,
 )
@@ -73,7 +78,12 @@ def scan(
     carriers: Carriers = None,
     profile: Profile = None,
     levels: Levels = None,
+    codes: Codes = None,
+    first: First = None,
+    unmodulated: Unmodulated = None,
     white: White = False,
+    code: Code = None,
+    inverse: Inverse = None,
     repeat: Annotated[
         int,
         typer.Option(
@@ -108,7 +118,22 @@ def scan(
     """
     if rig is not None and connect is not None:
         raise typer.BadParameter("--rig and --connect exclude each other: a running daemon has a rig of its own")
-    members = PatternOptions(frequencies, shifts, axis, bits, carriers, profile, levels, white or None).members(method)
+    said = PatternOptions(
+        frequencies,
+        shifts,
+        axis,
+        bits,
+        carriers,
+        profile,
+        levels,
+        white or None,
+        codes,
+        first,
+        unmodulated,
+        code,
+        inverse,
+    )
+    members = said.members(method)
     params: dict[str, Any] = {
         "pattern": members or None,
         "exposure": None if exposure is None else exposure_given(exposure),

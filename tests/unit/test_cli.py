@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,16 @@ def test_version_and_bare_call(run: Run) -> None:
         (["scan", "--frequencies", "1,8", "--shifts", "4,4,4"], "3 numbers for 2 frequencies"),
         (["scan", "--carriers", "5,6"], "says nothing to the method pmp"),
         (["scan", "--method", "mcp", "--bits", "3"], "needs --carriers"),
+        (["scan", "--method", "mcp", "--carriers", "50"], "2 to 6"),
+        (["scan", "--method", "mcp", "--codes", "0,-1"], "whole numbers from 0"),
+        (["scan", "--method", "mcp", "--carriers", "40,80", "--codes", "0,1,2,2"], "0 .. 3, each once"),
+        (["scan", "--method", "mcp", "--first", "dark"], "modulated, unmodulated"),
+        (["scan", "--method", "mcp", "--unmodulated", "0.5"], "--levels composite"),
+        (["scan", "--method", "mcp", "--levels", "composite", "--unmodulated", "1.5"], "at most 1"),
+        (["scan", "--method", "gray", "--first", "modulated"], "says nothing to the method gray"),
+        (["scan", "--no-inverse"], "--inverse/--no-inverse says nothing to the method pmp"),
+        (["scan", "--method", "gray", "--code", "morse"], "gray, binary"),
+        (["live", "--carriers", "40,80", "--codes", "1,2,3,4"], "0 .. 3, each once"),
         (["scan", "--method", "mcp", "--axis", "xy"], "--axis"),
         (["scan", "--depth", "500:400"], "smaller first"),
         (["scan", "--depth", "near"], "depth must be"),
@@ -304,7 +315,21 @@ def test_check_config_opens_the_calibration(run: Run, tmp_path: Path) -> None:
         ["pmp", "--frequencies", "1,4,16.5", "--shifts", "3", "--axis", "xy"],
         ["mcp", "--size", "1152x864"],
         ["mcp", "--size", "640x480", "--carriers", "40,70,100", "--axis", "x", "--levels", "composite"],
+        [
+            "mcp",
+            "--white",
+            "--levels",
+            "composite",
+            "--first",
+            "unmodulated",
+            "--unmodulated",
+            "0.5",
+            "--size",
+            "800x600",
+        ],
         ["gray", "--bits", "5"],
+        ["gray", "--no-inverse", "--code", "binary", "--axis", "x"],
+        ["gray+pmp", "--inverse", "--bracketed"],
         ["pmp", "--bracketed", "--gamma", "2.2"],
     ],
 )
@@ -323,6 +348,36 @@ def test_patterns_are_what_their_description_says(words: list[str], run: Run, tm
         assert image.dtype == np.uint8
         np.testing.assert_array_equal(image, sequence.image(position))
     assert bool(content["pattern"]["sentinels"]) == ("--bracketed" in words)
+    for option, value in pairwise(words):
+        if option in ("--code", "--first", "--levels"):
+            assert content["pattern"][option.removeprefix("--")] == value
+    if "--unmodulated" in words:
+        assert content["pattern"]["unmodulated"] == 0.5
+    if words[0] == "gray":
+        needed = "--no-inverse" in words
+        assert content["pattern"]["inverse"] is not needed
+        assert (content["pattern"]["white"] is not None) is needed
+
+
+def test_mcp_carriers_alone_keep_the_default_order_of_code_words(run: Run, tmp_path: Path) -> None:
+    def made(folder: str, *words: str) -> tuple[list[int], str]:
+        status, _, err = run("patterns", "mcp", "--size", "640x480", "-o", folder, *words)
+        assert status == 0
+        return json.loads((tmp_path / folder / "pattern.json").read_text())["pattern"]["codes"], err
+
+    default, _ = made("default")
+    assert default != sorted(default)
+    four = ("--carriers", "40,70,100,130")
+    codes, err = made("four", *four)
+    assert codes == default
+    assert "note:" not in err
+    codes, err = made("three", "--carriers", "40,70,100")
+    assert codes == list(range(8))
+    assert "note: code words of 3 bits stand in natural order" in err
+    assert "--codes" in err
+    given = ",".join(map(str, range(15, -1, -1)))
+    assert made("given", *four, "--codes", given)[0] == list(range(15, -1, -1))
+    assert made("alone", "--codes", given)[0] == list(range(15, -1, -1))
 
 
 def test_an_output_folder_that_is_not_empty_is_refused(run: Run, tmp_path: Path) -> None:
