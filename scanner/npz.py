@@ -11,12 +11,13 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanner.errors import StorageError
+from scanner.storage import Written
 
 MAX_BYTES = 4 << 30
 """Of one array: a scan of a 100-megapixel camera stays below it."""
@@ -33,29 +34,44 @@ class NpzWriter:
         """`file` is empty, and stays open."""
         self._file = file
         self._members: list[zipfile.ZipInfo] = []
+        self._unsummed: list[tuple[zipfile.ZipInfo, bytearray, memoryview]] = []
 
-    def add(self, name: str, array: NDArray[Any]) -> int:
-        """Write an array; returns where in the file its first byte is, C-contiguous from there on."""
+    def add(self, name: str, array: NDArray[Any], *, now: bool = False) -> int:
+        """Write an array; returns where in the file its first byte is, C-contiguous from there on.
+
+        Args:
+            name: in the archive, without the ending.
+            array: does not change until the file is closed.
+            now: somebody waits for the bytes: the checksum is made, and written before them, by `close`. The file is
+                one of `storage.replacing`.
+        """
         solid = np.ascontiguousarray(array)
         header = io.BytesIO()
         np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(solid))
-        return self._append(f"{name}.npy", header.getvalue(), bytes_of(solid))
+        return self._append(f"{name}.npy", header.getvalue(), bytes_of(solid), now=now)
 
     def close(self) -> None:
         """Write the list of members."""
+        for info, head, content in self._unsummed:
+            info.CRC = zlib.crc32(content, zlib.crc32(head[len(info.FileHeader()) :]))
+            head[: len(info.FileHeader())] = info.FileHeader()
+            cast(Written, self._file).rewrite(head, info.header_offset)
         with zipfile.ZipFile(self._file, "w", zipfile.ZIP_STORED) as archive:
             archive.filelist = self._members
             archive._didModify = True  # type: ignore[attr-defined]
 
-    def _append(self, name: str, header: bytes, content: memoryview) -> int:
+    def _append(self, name: str, header: bytes, content: memoryview, *, now: bool) -> int:
         """A member whose checksum stands in its header from the start: zipfile would go back to write it later."""
         file = self._file
         info = zipfile.ZipInfo(name)  # dated 1980, whatever the clock says
         info.external_attr = 0o644 << 16
         info.header_offset = file.tell()
         info.file_size = info.compress_size = len(header) + len(content)
-        info.CRC = zlib.crc32(content, zlib.crc32(header))
-        file.write(info.FileHeader() + header)
+        info.CRC = 0 if now else zlib.crc32(content, zlib.crc32(header))
+        head = bytearray(info.FileHeader() + header)
+        if now:
+            self._unsummed.append((info, head, content))
+        file.write(head)
         first = file.tell()
         file.write(content)
         self._members.append(info)

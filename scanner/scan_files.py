@@ -97,7 +97,8 @@ class ScanWriter:
         with self._timed(_BOTH):
             # As many maps as there may be: what is too much is given back.
             npz = self._begin_npz(xyz.nbytes + 9 * confidence.nbytes)
-            return tuple(self._add(npz, name, array) for name, array in (("xyz", xyz), ("confidence", confidence)))
+            first = (("xyz", xyz), ("confidence", confidence))
+            return tuple(self._add(npz, name, array, now=True) for name, array in first)
 
     def write(self, scan: Scan, progress: Progress | None = None) -> tuple[str, ...]:
         """Write all files, each whole; report.json last. Returns their names, of which `progress` is told in order.
@@ -129,9 +130,9 @@ class ScanWriter:
         self._npz = NpzWriter(file)
         return self._npz
 
-    def _add(self, npz: NpzWriter, name: str, array: NDArray[Any]) -> ArrayPlace:
+    def _add(self, npz: NpzWriter, name: str, array: NDArray[Any], *, now: bool = False) -> ArrayPlace:
         self._there[name] = array
-        return ArrayPlace(name, array.dtype.str, array.shape, npz.add(name, array), array.nbytes)
+        return ArrayPlace(name, array.dtype.str, array.shape, npz.add(name, array, now=now), array.nbytes)
 
     def _write_arrays(self, scan: Scan) -> None:
         arrays = scan.arrays()

@@ -56,7 +56,7 @@ def replacing(path: Path, digests: Digests | None = None, *, room: int = 0) -> I
             with temporary.open("wb", buffering=0) as raw:
                 if room:
                     os.posix_fallocate(raw.fileno(), 0, room)
-                file = _Written(raw, remember=digests is not None)
+                file = Written(raw, remember=digests is not None)
                 yield cast(BinaryIO, file)
                 if room:
                     os.ftruncate(raw.fileno(), raw.tell())
@@ -92,7 +92,7 @@ def temporary_of(path: Path) -> Path:
     return path.with_name(f".{path.name}.tmp")
 
 
-class _Written:
+class Written:
     """A file that is written straight from memory, and may remember from where."""
 
     def __init__(self, file: Any, *, remember: bool) -> None:
@@ -110,6 +110,13 @@ class _Written:
         while left:
             left = left[self._file.write(left) :]
         return size
+
+    def rewrite(self, part: bytearray, offset: int) -> None:
+        """Write again, at its place, a part that was changed since it was written."""
+        left = memoryview(part)
+        while left:
+            done = os.pwrite(self._file.fileno(), left, offset)
+            left, offset = left[done:], offset + done
 
     def flush(self) -> None:
         """Nothing waits in here."""

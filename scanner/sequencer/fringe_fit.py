@@ -84,15 +84,31 @@ def bright_pixels(scene: Scene, fit: Fit, clipped: NDArray[np.bool_]) -> NDArray
 
 def mean_vector(fit: Fit, use: NDArray[np.bool_] | NDArray[np.intp]) -> float:
     """Length of the mean phase vector: 1 where the scene shows one phase only, 0 where it shows all alike."""
-    return float(np.abs(np.exp(2j * np.pi * fit.cycles[use]).mean()))
+    angles = np.float32(2 * np.pi) * fit.cycles[use]
+    return float(np.hypot(np.cos(angles).mean(), np.sin(angles).mean()))
 
 
-def disorder(fit: Fit, use: NDArray[np.bool_]) -> tuple[float, tuple[int, ...]] | None:
+def left_over(design: NDArray[np.float64], frames: Array, b: Array) -> Array:
+    """(N, P) residual of frames over B."""
+    left = frames - design.astype(np.float32) @ solve(design, frames)
+    left /= b
+    return left
+
+
+def rms(left: Array) -> float:
+    """Of a residual over B: over frames, median over pixels."""
+    return float(np.sqrt(np.median((left**2).sum(axis=0)) / max(len(left) - 3, 1)))
+
+
+def disorder(fit: Fit, use: NDArray[np.bool_], left: Array) -> tuple[float, tuple[int, ...]] | None:
     """What of the residual no response explains, rms over B; and the positions that hold most of it.
 
     A projector's and camera's response bends all frames of a set alike: what frame n leaves at a pixel depends on
     theta + alpha_n alone, and on the same function of it for all n. Frames are compared bin by bin of that phase; the
     noise of the bins' means is taken off.
+
+    Args:
+        use: pixels that are asked. left: the residual there (`left_over`).
 
     Returns:
         None where the scene shows some phases too rarely, or too few frames leave a residual.
@@ -100,9 +116,6 @@ def disorder(fit: Fit, use: NDArray[np.bool_]) -> tuple[float, tuple[int, ...]] 
     count = len(fit.positions)
     if count < 4 or count != fit.fringe_set.shifts:
         return None
-    design = design_matrix(fit.alpha).astype(np.float32)
-    frames, b = fit.frames[:, use], fit.modulation[use]
-    left = (frames - design @ solve(design_matrix(fit.alpha), frames)) / b
     turns = fit.cycles[use][None, :] + (fit.alpha / (2 * np.pi)).astype(np.float32)[:, None]
     turns -= np.floor(turns)  # a remainder by division takes a hundred times as long
     index = (turns * PHASE_BINS).astype(np.intp)

@@ -23,7 +23,9 @@ from scanner.sequencer.fringe_fit import (
     design_matrix,
     disorder,
     fit_set,
+    left_over,
     mean_vector,
+    rms,
     solve,
 )
 from scanner.sequencer.witness_order import order_witnesses
@@ -90,13 +92,14 @@ def _residual(scene: Scene, fit: Fit, others: Sequence[Fit], bright: NDArray[np.
         return None
     name, called = f"residual {fit.fringe_set.frequency:g}{fit.fringe_set.axis}", _name(fit.fringe_set)
     design, frames, b = design_matrix(fit.alpha), fit.frames[:, bright], fit.modulation[bright]
-    left, noise = _rms(design, frames, b), scene.noise / float(np.median(b))
+    rest = left_over(design, frames, b)
+    left, noise = rms(rest), scene.noise / float(np.median(b))
     # A second harmonic of amplitude h B leaves N h^2 / 2 over N - 3 degrees of freedom.
     limit = MAX_HARMONIC * (count / 2 / (count - 3)) ** 0.5 + noise
     if left > 1.5 * noise and (found := _explained(fit, others, bright, left, noise)) is not None:
         wrong, says = found
         return Witness(name, False, left, limit, wrong, f"{called}: {says}")
-    if (seen := disorder(fit, bright)) is not None:
+    if (seen := disorder(fit, bright, rest)) is not None:
         (left, wrong), limit = seen, MAX_DISORDER + noise / 3
     else:
         wrong = _odd_one_out(fit, bright, left) if left > limit else ()
@@ -175,8 +178,7 @@ def _predict(alphas: NDArray[np.float64], found: Array) -> Array:
 
 def _rms(design: NDArray[np.float64], frames: Array, b: Array) -> float:
     """Residual over B, rms over frames, median over pixels."""
-    left = (frames - design.astype(np.float32) @ solve(design, frames)) / b
-    return float(np.sqrt(np.median((left**2).sum(axis=0)) / max(len(frames) - 3, 1)))
+    return rms(left_over(design, frames, b))
 
 
 def _exchange(design: NDArray[np.float64], frames: Array, b: Array, below: float) -> list[tuple[int, int]]:
@@ -271,13 +273,15 @@ def _copies(scene: Scene, fits: Sequence[Fit]) -> list[Witness]:
         stride = max(1, int(np.count_nonzero(use)) // 2000)
         chosen = np.flatnonzero(use)[::stride]
         own = _varied(fit, chosen)
+        frames_here = fit.frames.take(chosen, axis=1)
         for later in fits[f:]:
             if later is not fit and not (own and _varied(later, chosen)):
                 continue
             if not (pairs := _pairs(fit, later)):
                 continue
             ones, others = (list(indices) for indices in zip(*pairs, strict=True))
-            differences = sigmas_between(fit.frames[:, chosen][ones], later.frames[:, chosen][others])
+            frames_there = frames_here if later is fit else later.frames.take(chosen, axis=1)
+            differences = sigmas_between(frames_here[ones], frames_there[others])
             expected = np.full(len(pairs), 8 * noise)
             if later is fit:
                 model = fit.model(chosen)
