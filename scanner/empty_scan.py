@@ -33,9 +33,9 @@ def raise_if_empty(decoded: Decoded) -> None:
     Raises:
         DecodeError: with the reasons that dominate, and what to do about the first of them.
     """
-    counts = np.bincount(decoded.reason.reshape(-1), minlength=len(Reason))
-    if counts[Reason.VALUE] or not counts.any():
+    if decoded.reason.size == 0 or (decoded.reason == Reason.VALUE).any():
         return
+    counts = np.bincount(decoded.reason.reshape(-1), minlength=len(Reason))
     lit = counts.copy()
     lit[Reason.SHADOW] = 0
     order = [Reason(int(i)) for i in np.argsort(-lit if lit.any() else -counts, kind="stable")]
