@@ -16,7 +16,7 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -54,6 +54,9 @@ DEFAULT_STATE = Path("/var/lib/fringed")
 LOCK_S = 5.0
 """How long the children of a daemon that was killed may take to end."""
 
+OnReady = Callable[[Mapping[str, str]], None]
+"""Takes the endpoints by name"""
+
 _log = logging.getLogger(__name__)
 
 
@@ -79,6 +82,11 @@ class Daemon:
         self._number = 0
         self._stopped = asyncio.Event()
         self._notifier = Notifier()
+
+    @property
+    def endpoints(self) -> Mapping[str, str]:
+        """Where it listens: control, and the others as `hello` names them."""
+        return vars(self._endpoints)
 
     async def run(self, ready: asyncio.Event | None = None) -> None:
         """Serve until `stop`.
@@ -206,7 +214,12 @@ def _spool(config: RigConfig, state_dir: Path) -> Spool:
 
 
 def run_daemon(
-    config: RigConfig, *, state_dir: Path = DEFAULT_STATE, endpoint: str = "", lifeline: bool = False
+    config: RigConfig,
+    *,
+    state_dir: Path = DEFAULT_STATE,
+    endpoint: str = "",
+    lifeline: bool = False,
+    ready: OnReady | None = None,
 ) -> None:
     """Run a daemon until it is told to end: by a client, SIGTERM, SIGINT or SIGHUP, or its lifeline.
 
@@ -215,14 +228,16 @@ def run_daemon(
         state_dir: job records, and the spool where the rig file names none.
         endpoint: control endpoint; "": the rig file's.
         lifeline: end when standard input closes, and say "ready" on standard output.
+        ready: told the endpoints by name once they answer.
 
     Raises:
         ConfigError, StorageError, ProtocolError: it cannot begin.
     """
-    asyncio.run(_run(config, state_dir, endpoint or config.daemon.endpoint, lifeline))
+    tell = _say_ready if lifeline else ready
+    asyncio.run(_run(config, state_dir, endpoint or config.daemon.endpoint, lifeline, tell))
 
 
-async def _run(config: RigConfig, state_dir: Path, endpoint: str, lifeline: bool) -> None:
+async def _run(config: RigConfig, state_dir: Path, endpoint: str, lifeline: bool, tell: OnReady | None) -> None:
     daemon = Daemon(config, state_dir=state_dir, endpoint=endpoint)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -230,7 +245,7 @@ async def _run(config: RigConfig, state_dir: Path, endpoint: str, lifeline: bool
             continue  # nohup
         loop.add_signal_handler(number, daemon.stop)
     ready = asyncio.Event()
-    telling = asyncio.create_task(_tell_ready(ready)) if lifeline else None
+    telling = None if tell is None else asyncio.create_task(_tell_ready(ready, tell, daemon.endpoints))
     if lifeline:
         loop.add_reader(sys.stdin.fileno(), _read_lifeline, daemon)
     try:
@@ -247,8 +262,12 @@ def _read_lifeline(daemon: Daemon) -> None:
         daemon.stop()
 
 
-async def _tell_ready(ready: asyncio.Event) -> None:
+async def _tell_ready(ready: asyncio.Event, tell: OnReady, endpoints: Mapping[str, str]) -> None:
     await ready.wait()
+    tell(endpoints)
+
+
+def _say_ready(_endpoints: Mapping[str, str]) -> None:
     print("ready", flush=True)
 
 

@@ -33,7 +33,7 @@ from service.commands import (
     simulate,
     status,
 )
-from service.terminal import error_document, print_error, print_json
+from service.terminal import begin_output, error_document, print_error, print_failure
 
 FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
 
@@ -78,6 +78,7 @@ _list_whole_sentences(app)
 
 def run(words: list[str], *, debug: bool, as_json: bool) -> int:
     """Run one command and return its exit status. No traceback reaches the user, but for `debug`."""
+    begin_output()
     try:
         return _flushed(_run(words, as_json))
     except BrokenPipeError:
@@ -120,7 +121,7 @@ def _run(words: list[str], as_json: bool) -> int:
         else:
             print_error(message, f"{path} --help")
         if as_json:
-            print_json({"error": {"code": WRONG_USAGE, "message": message, "class": "UsageError"}})
+            print_failure({"error": {"code": WRONG_USAGE, "message": message, "class": "UsageError"}})
         return WRONG_USAGE
     except (KeyboardInterrupt, typer.Abort):
         return _interrupted(as_json)
@@ -129,14 +130,14 @@ def _run(words: list[str], as_json: bool) -> int:
 def _failed(error: ScannerError, as_json: bool) -> int:
     print_error(str(error), error.hint)
     if as_json:
-        print_json(error_document(error))
+        print_failure(error_document(error))
     return FAILED
 
 
 def _interrupted(as_json: bool) -> int:
     print_error("interrupted")
     if as_json:
-        print_json({"error": {"code": INTERRUPTED, "message": "interrupted", "class": "Interrupted"}})
+        print_failure({"error": {"code": INTERRUPTED, "message": "interrupted", "class": "Interrupted"}})
     return INTERRUPTED
 
 
@@ -157,4 +158,4 @@ def _report_bug(error: Exception, *, debug: bool, as_json: bool) -> None:
         Path(name).write_text(text, encoding="utf-8")
         print_error(message, f"this is a bug; what happened stands in {name} (--debug shows it here)")
     if as_json:
-        print_json({"error": {"code": FAILED, "message": message, "class": type(error).__name__}})
+        print_failure({"error": {"code": FAILED, "message": message, "class": type(error).__name__}})

@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -154,8 +155,24 @@ def print_facts(title: str, facts: Sequence[tuple[str, Any]]) -> None:
     Console().print(table)
 
 
+@dataclass
+class _Output:
+    """What this program has printed so far."""
+
+    document: bool = False
+
+
+_output = _Output()
+
+
+def begin_output() -> None:
+    """A command begins: its document is not printed yet."""
+    _output.document = False
+
+
 def print_json(content: Any) -> None:
     """The one JSON document on standard output. Numbers that JSON has no form for (NaN, infinity) become null."""
+    _output.document = True
     print(json.dumps(_finite(content), indent=1, ensure_ascii=False, default=str), flush=True)
 
 
@@ -166,6 +183,12 @@ def print_error(message: str, hint: str | None = None, *, label: str = "error") 
     print(f"{red}{label}:{plain} {message}", file=sys.stderr)
     if hint:
         print(f"{faint}hint:{plain} {hint}", file=sys.stderr, flush=True)
+
+
+def print_failure(content: Any) -> None:
+    """The document of what ended a command, unless its own is out: what serves prints that when it begins."""
+    if not _output.document:
+        print_json(content)
 
 
 def error_document(error: ScannerError) -> dict[str, Any]:

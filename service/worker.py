@@ -16,6 +16,7 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 
 import msgspec
@@ -87,13 +88,15 @@ class Worker:
         self._said = 0.0
         self._work = Work(self._answer, decode=decode)
 
-    def run(self) -> None:
-        """Serve until told to stop or until the lifeline closes."""
+    def run(self, ready: Callable[[], None] | None = None) -> None:
+        """Serve until told to stop or until the lifeline closes; `ready` is called once the daemon can know of it."""
         thread = threading.Thread(target=self._work.serve, args=(self._jobs,), name="decoder", daemon=True)
         thread.start()
         try:
             self._socket.poll(CONNECT_MS, zmq.POLLOUT)
             self._ready()
+            if ready is not None:
+                ready()
             self._talk(thread)
         finally:
             self._work.cancel(None)
@@ -196,19 +199,20 @@ class Worker:
         self._said = time.monotonic()
 
 
-def run_worker(endpoint: str, *, decode: bool = True) -> None:
+def run_worker(endpoint: str, *, decode: bool = True, ready: Callable[[], None] | None = None) -> None:
     """Serve the daemon at `endpoint` (its control endpoint) until it says stop.
 
     Args:
         endpoint: as for a client.
         decode: False checks digests and decodes nothing.
+        ready: called once it takes work.
 
     Raises:
         Unreachable: no daemon there.
     """
     with Client(endpoint, name="worker") as client:
         address = client.hello()["endpoints"]["worker"]
-    Worker(address, decode=decode).run()
+    Worker(address, decode=decode).run(ready)
 
 
 def main() -> int:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from service.commands.options import AsJson
+from service.terminal import print_json
 
 
 def daemon(
@@ -23,8 +27,11 @@ def daemon(
             "/var/lib/fringed for root, ~/.local/state/fringed for others.",
         ),
     ] = None,
+    as_json: AsJson = False,
 ) -> int:
     """Drive a rig and answer clients, until told to stop.
+
+    With --json the document is printed once clients are answered: endpoints, pid and rig.
 
     \b
     Examples:
@@ -38,32 +45,41 @@ def daemon(
 
     rig = load_rig(config)
     start_logging("daemon")
-    run_daemon(rig, state_dir=state or state_folder(), endpoint=connect or rig.daemon.endpoint, lifeline=False)
+
+    def ready(endpoints: Mapping[str, str]) -> None:
+        if as_json:
+            print_json({"endpoints": dict(endpoints), "pid": os.getpid(), "rig": rig.rig.name})
+
+    run_daemon(rig, state_dir=state or state_folder(), endpoint=connect or rig.daemon.endpoint, ready=ready)
     return 0
 
 
 def worker(
-    connect: Annotated[str, typer.Option("--connect", metavar="ENDPOINT", help="The daemon's endpoint for workers.")],
+    connect: Annotated[
+        str, typer.Option("--connect", metavar="ENDPOINT", help="The daemon's endpoint, as for clients.")
+    ],
+    as_json: AsJson = False,
 ) -> int:
     """Decode for a daemon, beside the workers it starts itself, until told to stop.
 
-    Its endpoint for workers stands beside the one for clients: worker.ipc by control.ipc, NAME-worker.ipc by NAME.ipc.
+    The daemon says where its endpoint for workers is. With --json the document is printed once it takes work: endpoint
+    and pid.
 
     \b
     Examples:
-      fringed worker --connect ipc:///run/fringed/worker.ipc
-      fringed worker --connect ipc:///tmp/try-worker.ipc   of a daemon at ipc:///tmp/try.ipc
+      fringed worker --connect ipc:///run/fringed/control.ipc
+      fringed worker --connect ipc:///tmp/try.ipc          of fringed daemon simulated --endpoint ipc:///tmp/try.ipc
     """
-    from scanner.errors import Unreachable  # noqa: PLC0415
     from service.logs import start_logging  # noqa: PLC0415
     from service.worker import run_worker  # noqa: PLC0415
 
     start_logging("worker")
-    try:
-        run_worker(connect)
-    except Unreachable as error:
-        error.hint = "of a daemon at ipc:///DIR/NAME.ipc give ipc:///DIR/NAME-worker.ipc; of control.ipc worker.ipc"
-        raise
+
+    def ready() -> None:
+        if as_json:
+            print_json({"endpoint": connect, "pid": os.getpid()})
+
+    run_worker(connect, ready=ready)
     return 0
 
 

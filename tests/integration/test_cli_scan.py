@@ -44,6 +44,13 @@ def running(*words: Any, environment: Mapping[str, str] | None = None) -> Iterat
             it.kill()
 
 
+def first_document(process: subprocess.Popen[str]) -> Any:
+    """What it has printed once it serves."""
+    assert process.stdout is not None
+    lines = "".join(iter(process.stdout.readline, "}\n"))
+    return json.loads(lines + "}")
+
+
 def test_a_scan_from_nothing_to_files_and_again(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     words = ("scan", "--rig", "simulated:quick/board", "-o", folder)
@@ -149,11 +156,17 @@ def test_a_disk_without_room_is_noticed_before_the_run(tmp_path: Path, monkeypat
 
 def test_a_running_daemon_is_asked_for_scans(tmp_path: Path) -> None:
     endpoint = f"ipc://{tmp_path}/control.ipc"
-    with running("daemon", "simulated:quick/board", "--endpoint", endpoint, "--state", tmp_path / "state") as daemon:
-        deadline = time.monotonic() + PATIENCE_S
-        while (asked := fringed("status", "--connect", endpoint, "--json")).returncode:
-            assert "fringed daemon" in asked.stderr
-            assert time.monotonic() < deadline
+    state = tmp_path / "state"
+    with running("daemon", "simulated:quick/board", "--endpoint", endpoint, "--state", state, "--json") as daemon:
+        told = first_document(daemon)
+        assert (told["pid"], told["endpoints"]["control"]) == (daemon.pid, endpoint)
+        assert set(told) == {"endpoints", "pid", "rig"}
+        with running("worker", "--connect", endpoint, "--json") as worker:
+            assert first_document(worker) == {"endpoint": endpoint, "pid": worker.pid}
+            worker.send_signal(signal.SIGINT)
+            rest, said = worker.communicate(timeout=PATIENCE_S)
+        assert (worker.returncode, rest) == (130, ""), said
+        assert "error: interrupted" in said
         for method in ("mcp", "gray"):
             ran = fringed("scan", "--connect", endpoint, "--method", method, "-o", tmp_path / method, "--json")
             assert ran.returncode == 0, ran.stderr
@@ -162,8 +175,8 @@ def test_a_running_daemon_is_asked_for_scans(tmp_path: Path) -> None:
         assert [scan["state"] for scan in scans] == ["done", "done"]
         assert fringed("status", "--connect", endpoint).returncode == 0
         daemon.send_signal(signal.SIGTERM)
-        daemon.communicate(timeout=PATIENCE_S)
-    assert daemon.returncode == 0
+        rest, _ = daemon.communicate(timeout=PATIENCE_S)
+    assert (daemon.returncode, rest) == (0, "")
 
 
 def test_preview_writes_a_picture_and_tells_how_bright_it_is(tmp_path: Path) -> None:
