@@ -17,6 +17,7 @@ from scanner.decode.mcp.locate import Array, Found, Image, Known, Stages, locate
 from scanner.decode.mcp.maps import fill_rows, maps_of
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.ranks import median
+from scanner.decode.mcp.stripes import MIN_PITCH_PX
 from scanner.decode.mcp.white import RATIO_BITS, divided, in_grey_levels
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
@@ -282,7 +283,19 @@ def _explain(found: Found, image: Image, model: PatternModel, camera: CameraForm
     """Raise what `locate` found wrong; a pattern turned by 90 degrees is named."""
     if found.pitch > 0:
         _refuse_turned(image, model, camera)
-    raise DecodeError(str(found.fault), hint=found.hint)
+    hints = [hint for hint in (found.hint, _too_fine(image, model)) if hint is not None]
+    raise DecodeError(str(found.fault), hint="; ".join(hints) or None)
+
+
+def _too_fine(image: Image, model: PatternModel) -> str | None:
+    """What to do where stripes are finer than can be decoded even if the pattern fills the picture."""
+    pitch = image.shape[0] / model.stripes
+    if pitch >= MIN_PITCH_PX:
+        return None
+    return (
+        f"stripes may be too fine for this camera: {model.stripes} on {image.shape[0]} px are {pitch:.1f} px high, "
+        f"{MIN_PITCH_PX:g} are needed. Take frames of more pixels, move the camera nearer, or project fewer bits"
+    )
 
 
 def _refuse_turned(image: Image, model: PatternModel, camera: CameraFormat) -> None:
