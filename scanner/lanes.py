@@ -6,8 +6,9 @@ and squares without leaving the registers. Where registers are narrower, more of
 results are the same.
 
 Lanes exist in compiled code only: floats (float32), whole numbers (int32), short ones (int16) and masks. `+ - * /`,
-comparisons, `&` and `|` work lane by lane, with a scalar on either side as well; comparisons make masks, `choose` picks
-by them. Numba knows no such type by itself: this file teaches it one, by the rules of its extension interface.
+comparisons, `&`, `|`, `^` and `>>` (which fills with zeros) work lane by lane, with a scalar on either side as well;
+comparisons make masks, `choose` picks by them. Numba knows no such type by itself: this file teaches it one, by the
+rules of its extension interface.
 """
 
 from __future__ import annotations
@@ -42,6 +43,8 @@ class Lanes(Protocol):
     def __ge__(self, other: Any) -> Lanes: ...
     def __and__(self, other: Any) -> Lanes: ...
     def __or__(self, other: Any) -> Lanes: ...
+    def __xor__(self, other: Any) -> Lanes: ...
+    def __rshift__(self, other: Any) -> Lanes: ...
 
 
 class _LanesType(types.Type):
@@ -141,8 +144,11 @@ for _plain, _in_place, _floating, _whole in (
 _teach(operator.truediv, {"float": _FLOATS}, _instruction("fdiv", "sdiv"))
 for _relation, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
     _teach(_relation, _TO_MASKS, _compare(_sign))
-_teach(operator.and_, {"mask": _MASK}, _instruction("and_", "and_"))
-_teach(operator.or_, {"mask": _MASK}, _instruction("or_", "or_"))
+_BITS = {"whole": _WHOLE, "short": _SHORT}
+_teach(operator.and_, {"mask": _MASK, **_BITS}, _instruction("and_", "and_"))
+_teach(operator.or_, {"mask": _MASK, **_BITS}, _instruction("or_", "or_"))
+_teach(operator.xor, _BITS, _instruction("xor", "xor"))
+_teach(operator.rshift, _BITS, _instruction("lshr", "lshr"))
 _teach(least, _NUMBERS, _extreme("<"))
 _teach(greatest, _NUMBERS, _extreme(">"))
 
@@ -232,6 +238,23 @@ floats = _converted(_FLOATS, {"whole": "sitofp", "short": "sitofp"})
 """Whole or short numbers, or a scalar for all lanes, as floats."""
 whole = _converted(_WHOLE, {"float": "fptosi", "short": "sext"})
 """Floats without their fraction, short numbers, or a scalar for all lanes, as whole numbers."""
+word = _converted(_WHOLE, {"short": "zext"})
+"""Short or whole numbers that are words of bits, without a sign, as whole numbers."""
+
+
+def _as_samples(context: Any, x: Any, like: Any) -> Any:
+    kind = _SHORT if like.dtype.bitwidth == 8 else _WHOLE
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        if x is _FLOATS:
+            return builder.fptosi(values[0], kind.vector)
+        return _in_lanes(context, builder, values[0], x, kind)
+
+    return kind(x, like), generate
+
+
+as_samples: Callable[[Any, NDArray[Any]], Lanes] = _intrinsic(_as_samples)
+"""as_samples(x, like): floats without their fraction, or a scalar for all lanes, of the kind that `samples` are."""
 
 
 def _power_of_two(context: Any, exponent: Any) -> Any:
@@ -331,6 +354,23 @@ def _load(context: Any, array: Any, at: Any) -> Any:
 
 load: Callable[[NDArray[Any], int], Lanes] = _intrinsic(_load)
 """load(row, at): floats from row[at] on, of a (n,) float32 array. Nothing checks that there are as many."""
+
+
+def _stream(context: Any, array: Any, at: Any, lanes: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        row, first, value = values
+        pointer = _pointer(context, builder, signature.args[0], row, first, value.type)
+        stored = builder.store(value, pointer, align=64)
+        stored.set_metadata("nontemporal", builder.module.add_metadata([ir.Constant(ir.IntType(32), 1)]))
+        return context.get_dummy_value()
+
+    return (types.void(array, types.intp, lanes), generate) if lanes is _FLOATS else None
+
+
+stream: Callable[[NDArray[Any], int, Lanes], None] = _intrinsic(_stream)
+"""stream(row, at, lanes): floats into a (n,) float32 array that nobody reads soon, past the caches.
+
+row[at] must begin a cache line (`scanner.decode.addresses.aligned_rows`): anything else ends the process."""
 
 
 def _store(context: Any, array: Any, at: Any, lanes: Any) -> Any:

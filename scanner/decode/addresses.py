@@ -45,6 +45,22 @@ def pixels_at(address: int, first: int, count: int, like: NDArray[Any]) -> NDArr
 
 
 @kernel
+def copies_of(
+    addresses: NDArray[np.intp], at: int, size: int, like: NDArray[Any], spare: NDArray[Any]
+) -> NDArray[np.intp]:
+    """Addresses of copies of `size` pixels from `at` on, for less than a vector of them: nothing may be read beyond a
+    frame's last pixel. spare: (F, a vector's length) that
+    holds them. For kernels; address 0 stays what it is."""
+    copies = np.empty_like(addresses)
+    for n in range(addresses.size):
+        copies[n] = 0
+        if addresses[n] != 0:
+            spare[n, :size] = pixels_at(addresses[n], at, size, like)
+            copies[n] = spare[n:].ctypes.data - at * like.itemsize
+    return copies
+
+
+@kernel
 def aligned_rows(rows: int, length: int) -> NDArray[np.float32]:
     """(rows, length) float32 whose rows begin with a cache line, for lengths that are multiples of 16. For kernels.
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.addresses import CACHE_LINE, aligned_rows
-from scanner.decode.pmp_sums import copies_of, fit_lanes, turns_of
+from scanner.decode.addresses import CACHE_LINE, aligned_rows, copies_of
+from scanner.decode.pmp_sums import fit_lanes, turns_of
 from scanner.decode.reasons import count_reasons
 from scanner.kernel import contracting_kernel, inlined_kernel
 from scanner.lanes import (

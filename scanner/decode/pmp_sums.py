@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.addresses import aligned_rows, pixels_at
+from scanner.decode.addresses import aligned_rows, copies_of
 from scanner.kernel import contracting_kernel, inlined_kernel
 from scanner.lanes import (
     LANES,
@@ -115,19 +115,6 @@ def fit_runs(
                 mean[to + i] = spot[2 * sets * LANES + skip + i]
                 residual[to + i] = spot[(2 * sets + 1) * LANES + skip + i]
                 clipped[to + i] = spot[(2 * sets + 2) * LANES + skip + i] >= clip
-
-
-@contracting_kernel
-def copies_of(
-    addresses: NDArray[np.intp], at: int, size: int, like: NDArray[Any], spare: NDArray[Any]
-) -> NDArray[np.intp]:
-    """Addresses of copies of `size` pixels from `at` on, for less than a vector of them: nothing may be read beyond a
-    frame's last pixel. spare: (F, LANES) that holds them."""
-    copies = np.empty_like(addresses)
-    for n in range(addresses.size):
-        spare[n, :size] = pixels_at(addresses[n], at, size, like)
-        copies[n] = spare[n:].ctypes.data - at * like.itemsize
-    return copies
 
 
 @contracting_kernel
