@@ -1,7 +1,8 @@
 """How right the MCP decoder is, on the simulated rig: a table over scenes, patterns and seeds.
 
 Columns, as in mcp.md ("How to measure"): right, decoded peaks within half a pitch of truth; recall, true crossings of a
-stripe's middle on lit surface that have a right peak, those that an edge cuts and that give no row included; z med,
+stripe's middle on lit surface that have a right peak or name (stripes that an edge cuts or print breaks up have a name
+and no row; counted by `peaks` instead of `stripes` recall is the same to .001); z med,
 median depth error of right peaks, mm; 1 mm, share of right inside peaks within 1 mm; >20, share of peaks on lit surface
 beyond 20 mm; unlit, peaks outside what is lit; rms, depth of right inside peaks; then for dense rows: cover of lit
 pixels, z med, right, unlit. Inside: 7 px from edges of depth or shadow. The worst of all seeds is shown.

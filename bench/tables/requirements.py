@@ -55,8 +55,8 @@ def make() -> Page:
         TITLE,
         """
 The default decoder on casey2011, true calibration. *Right*: decoded peaks within half a stripe of truth. *Recall*:
-true crossings of a stripe's middle on lit surface that have a right peak (one that an edge cuts is named, and
-counted, though it gives no row). *Inside*: 7 px from edges of depth or
+true crossings of a stripe's middle on lit surface that have a right peak (one that an edge cuts, or print breaks up, is
+named, and counted, though it gives no row). *Inside*: 7 px from edges of depth or
 shadow. Verdict: *aim* reached, *must* reached, or *short*. Times are measured by `python bench/mcp.py`.
 """,
         grids,

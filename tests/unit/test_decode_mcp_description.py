@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scanner.decode.mcp import carriers, decision, description, emissions, hmm, linking, stripes
+from scanner.decode.mcp import carriers, decision, description, emissions, hmm, linking, stripes, tracks
 from scanner.decode.mcp.model import PatternModel
 from scanner.patterns import McpPattern, ProjectorSize
 
@@ -73,7 +73,7 @@ def test_carriers_of_one_set_are_not_taken_for_another_where_the_magnification_d
     at = np.tile(rows, len(columns)).astype(np.float32)
     peaks = stripes.Peaks(start, at, zero, zero, zero, zero, np.ones(count, np.uint8))
     signals = carriers.Signals(light.astype(np.float32).ravel(), zero)
-    found = carriers.search_carriers(signals, peaks, chains, PUBLISHED, 38 / 27, (1040, 1392))
+    found = carriers.search_carriers(signals, tracks.single(peaks, chains), PUBLISHED, 38 / 27, (1040, 1392))
     assert found.scale == pytest.approx(1.4, rel=0.02)
     assert found.drift_x == pytest.approx(0.1, abs=0.031)
     assert found.drift_y == pytest.approx(-0.12, abs=0.031)

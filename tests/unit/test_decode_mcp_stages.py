@@ -20,6 +20,7 @@ from scanner.decode.mcp import (
     ranks,
     stripes,
     subpixel,
+    tracks,
 )
 from scanner.decode.mcp.model import PatternModel
 from scanner.patterns import McpPattern, ProjectorSize
@@ -215,6 +216,7 @@ def test_amplitudes_and_magnification_of_made_signals(length):
     chains = linking.Chains(np.arange(len(column), dtype=np.int32), start, column)
     y = np.float32(20 + 40 * number)
     peaks = stripes.Peaks(np.zeros(2, np.int32), y, *(y * 0 + 1,) * 4, np.ones(len(y), np.uint8))
+    each = tracks.single(peaks, chains)
     shape = (40 * count, length)
     own = scale * np.exp(drift * (y * 2 / shape[0] - 1))
     x = np.arange(length)
@@ -227,11 +229,11 @@ def test_amplitudes_and_magnification_of_made_signals(length):
     size = magnification.window_px(OWN, scale)
     if length >= 2 * size:
         signals = carriers.Signals(flat, np.zeros(len(y), np.float32))
-        search = carriers.search_carriers(signals, peaks, chains, OWN, 1.38, shape)
+        search = carriers.search_carriers(signals, each, OWN, 1.38, shape)
         assert min(search.contrast) > 1.5
-        field = magnification.fit_field(flat, peaks, chains, OWN, search, size, shape) * search.scale
+        field = magnification.fit_field(flat, each, OWN, search, size, shape) * search.scale
         np.testing.assert_allclose(field, own, rtol=0.006)
-    seen = emissions.measure(flat, chains, np.float32(own / scale), OWN, scale, size)
+    seen = emissions.measure(flat, each, np.float32(own / scale), OWN, scale, size)
     expected = OWN.ratio[2 * (number % 16)] * (0.9, 0.8, 0.7, 0.6)
     assert np.abs(seen.ratio - expected).max() < 0.03
     assert np.median(seen.sigma) < 0.02

@@ -6,6 +6,7 @@ soft:
 
     stripes        pitch from the columns' spectrum; peaks and valleys in every fourth column      4.1
     linking        peaks chained along the stripes; evidence passed along them                     (5.4 grows regions)
+    tracks         short chains joined where print breaks a stripe up                              (not in the source)
     carriers       brightness along the chains; the magnification at which all carriers stand out  4.3
     magnification  the same at each peak, as a smooth field                                        (4.3 has one for all)
     emissions      amplitude of each carrier over local brightness; likelihood of each stripe      4.4, 4.5
@@ -20,7 +21,7 @@ module; it is not this one.
 
 from __future__ import annotations
 
-from scanner.decode.mcp import carriers
+from scanner.decode.mcp import carriers, tracks
 from scanner.decode.mcp.decoder import McpDecoder, decode_image
 from scanner.patterns import CameraFormat, McpPattern, ProjectorSize
 
@@ -37,3 +38,4 @@ def warm_up() -> None:
         frame = (10 + light * (0.8 * camera.max_value)).astype(camera.dtype)
         decode_image(frame, pattern, projector, camera)
     carriers.warm_up()
+    tracks.warm_up()

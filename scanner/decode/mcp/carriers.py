@@ -18,7 +18,8 @@ from scipy.fft import rfft
 
 from scanner.decode.mcp.linking import Chains
 from scanner.decode.mcp.model import PatternModel
-from scanner.decode.mcp.stripes import STEP, Image, Peaks
+from scanner.decode.mcp.stripes import STEP, Image
+from scanner.decode.mcp.tracks import WIDE, Tracks
 from scanner.kernel import kernel
 
 Array = NDArray[np.float32]
@@ -50,31 +51,65 @@ LOG_STEP = 0.004
 """Steps of the magnification: a quarter of a bin at the highest carrier."""
 
 
+FLAT = 0.35
+"""Sigma, in periods of the lowest carrier, of the means by which the light of joined tracks is divided: they leave that
+carrier .91 of its amplitude, and follow print of two periods to two thirds."""
+
+
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """light: (4 P,) float32, brightness above the valleys along each chain, four samples to a peak, in chain order.
-    clipped: (P,) float32, share of clipped pixels about each peak.
+    """light: (4 N,) float32, brightness along the tracks, four samples to a place, in the order of `Tracks.chains`:
+    above the valleys; along joined tracks over what is printed there, 1 in the mean. clipped: (P,) float32, share of
+    clipped pixels about each peak.
     """
 
     light: Array
     clipped: Array
 
 
-def signals_along(image: Image, peaks: Peaks, chains: Chains, pitch: float, limit: int) -> Signals:
-    """Image brightness along the chains, above the valleys.
+def signals_along(image: Image, tracks: Tracks, pitch: float, longest: float, limit: int) -> Signals:
+    """Image brightness along the tracks: above the valleys; along joined ones over what is printed there.
 
     Args:
         image: (H, W) as captured.
-        peaks: P peaks.
-        chains: their chains.
-        pitch: px. Rows within a sixth of it are averaged.
+        tracks: where P peaks and V places more are read.
+        pitch: px. Rows within a sixth of it are averaged; of joined tracks all of the stripe.
+        longest: period of the lowest carrier, px.
         limit: largest grey level: pixels at it are clipped.
     """
-    light = np.empty(STEP * len(peaks), np.float32)
-    clipped = np.zeros(len(peaks), np.float32)
-    reach = max(1, round(pitch / 6))
-    _signals(image, peaks.y, peaks.valley, chains.order, chains.start, chains.column, reach, limit, light, clipped)
-    return Signals(light, clipped)
+    chains = tracks.chains
+    light = np.empty(STEP * len(chains.order), np.float32)
+    clipped = np.zeros(len(tracks.y), np.float32)
+    reach = np.where(tracks.joined, max(1, round(WIDE * pitch)), max(1, round(pitch / 6))).astype(np.int32)
+    _signals(image, tracks.y, tracks.valley, chains.order, chains.start, chains.column, reach, limit, light, clipped)
+    if tracks.joined.any():
+        half = int(np.ceil(2.5 * FLAT * longest))
+        weights = np.exp(-0.5 * (np.arange(-half, half + 1) / (FLAT * longest)) ** 2).astype(np.float32)
+        _flatten(light, chains.start, tracks.joined, tracks.ambient, weights)
+    return Signals(light, clipped[: len(tracks.place)])
+
+
+@kernel
+def _flatten(light: Array, start: Ints, joined: NDArray[np.bool_], ambient: Array, weights: Array) -> None:
+    """Divide the light of joined tracks by its local mean, with `weights` (odd, symmetrical), in place.
+
+    What is printed multiplies pattern and ambient light alike: over their local mean both are without it. The pattern's
+    part is then drawn out by the ambient light's share. The result is 1 in the mean.
+    """
+    half = len(weights) // 2
+    for c in range(len(joined)):
+        if not joined[c]:
+            continue
+        first, size = STEP * start[c], STEP * (start[c + 1] - start[c])
+        total = light[first : first + size].copy()
+        gain = np.float32(1) / (np.float32(1) - ambient[c])
+        for q in range(size):
+            mean, weight = np.float32(0), np.float32(0)
+            for j in range(max(-half, -q), min(half, size - 1 - q) + 1):
+                mean += weights[half + j] * total[q + j]
+                weight += weights[half + j]
+            over = total[q] * weight / max(mean, np.float32(1e-6))
+            light[first + q] = np.float32(1) + (over - np.float32(1)) * gain
 
 
 @kernel
@@ -85,14 +120,14 @@ def _signals(
     order: Ints,
     start: Ints,
     column: Ints,
-    reach: int,
+    reaches: Ints,
     limit: int,
     light: Array,
     clipped: Array,
 ) -> None:
     height = image.shape[0]
     for c in range(len(start) - 1):
-        first, last = start[c], start[c + 1] - 1
+        first, last, reach = start[c], start[c + 1] - 1, reaches[c]
         for p in range(first, last + 1):
             k = order[p]
             before = order[max(p - 1, first)]
@@ -131,10 +166,10 @@ class CarrierSearch:
         return np.asarray(np.exp(self.drift_x * x + self.drift_y * y))
 
 
-def places(peaks: Peaks, chains: Chains, shape: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where the peaks lie in an image of `shape` (H, W): x and y from -1 to 1."""
-    x = chains.column.astype(np.float64) * (2.0 * STEP / shape[1]) - 1
-    return x, peaks.y.astype(np.float64) * (2.0 / shape[0]) - 1
+def places(tracks: Tracks, shape: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where the tracks' places lie in an image of `shape` (H, W): x and y from -1 to 1."""
+    x = tracks.chains.column.astype(np.float64) * (2.0 * STEP / shape[1]) - 1
+    return x, tracks.y.astype(np.float64) * (2.0 / shape[0]) - 1
 
 
 def are_short(chains: Chains, model: PatternModel, around: float) -> bool:
@@ -154,19 +189,18 @@ def _window_px(model: PatternModel, around: float) -> int:
 
 
 def search_carriers(
-    signals: Signals, peaks: Peaks, chains: Chains, model: PatternModel, around: float, shape: tuple[int, int]
+    signals: Signals, tracks: Tracks, model: PatternModel, around: float, shape: tuple[int, int]
 ) -> CarrierSearch:
     """Find the magnification, and its drift, at which all carriers stand out of the chains' spectra.
 
     Args:
-        signals: P peaks' brightness.
-        peaks: the peaks.
-        chains: their chains.
+        signals: brightness along the tracks.
+        tracks: where it was read.
         model: the pattern's tables.
         around: magnification expected, from the pitch.
         shape: (H, W) of the image.
     """
-    size = _window_px(model, around)
+    size, chains = _window_px(model, around), tracks.chains
     steps = np.arange(-np.log(SCALE_RANGE), np.log(SCALE_RANGE), LOG_STEP)
     scales = around * np.exp(steps)
     # Beyond .45 cycles a pixel neither columns of four pixels nor a blurred lens show a carrier.
@@ -176,7 +210,7 @@ def search_carriers(
     power, middle = _spectra(signals.light, chains, size)
     if not len(power) or len(scales) < 2:
         return CarrierSearch(around, 0.0, 0.0, (0.0,) * model.channels)
-    x, y = (place[middle] for place in places(peaks, chains, shape))
+    x, y = (place[middle] for place in places(tracks, shape))
     column = np.clip(((x + 1) * (TILES_X / 2)).astype(int), 0, TILES_X - 1)
     tile = np.clip(((y + 1) * (TILES_Y / 2)).astype(int), 0, TILES_Y - 1) * TILES_X + column
     logs, weights, at = [], [], []
@@ -234,8 +268,10 @@ def _align(
 
 
 def warm_up() -> None:
-    """Compile what only an image with long stripes comes to."""
+    """Compile what only images with long stripes, or with print, come to."""
     _shifted_sum(np.zeros((1, 2, 1)), np.zeros(1, np.int32), np.zeros((2, 1)))
+    one = np.ones(1, np.float32)
+    _flatten(np.ones(STEP, np.float32), np.arange(2, dtype=np.int32), np.ones(1, np.bool_), one, one)
 
 
 @kernel

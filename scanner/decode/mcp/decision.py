@@ -40,6 +40,10 @@ SWITCH_COST = 6.0
 """Natural logarithm of the odds against a change of stripe between two columns of one chain."""
 
 
+MEAN_LIGHT = np.float32(5 / 6)
+"""Mean of a triangle within a sixth of a pitch of its peak, as a share of its height: what light is elsewhere."""
+
+
 @dataclass(frozen=True, eq=False)
 class Decision:
     """label (P,) int32, -1 undecided; confidence (P,); light (P,); fine positions; figures for the report."""
@@ -61,14 +65,14 @@ def decide(found: Found, model: PatternModel, clock: Stages) -> Decision:
         model: the pattern's tables.
         clock: takes the stages' times.
     """
-    peaks, chains, signals, search = found.parts()
+    peaks, chains, tracks, signals, search = found.parts()
     size = magnification.window_px(model, search.scale)
     shape = (found.reduced.shape[1], found.reduced.shape[0] * stripes.STEP)
     with clock.stage("field"):
-        scale_field = magnification.fit_field(signals.light, peaks, chains, model, search, size, shape)
+        scale_field = magnification.fit_field(signals.light, tracks, model, search, size, shape)
     with clock.stage("emissions"):
-        seen = emissions.measure(signals.light, chains, scale_field, model, search.scale, size)
-    sites = linking.sites_of(peaks, chains)
+        seen = emissions.measure(signals.light, tracks, scale_field, model, search.scale, size)
+    sites = linking.sites_of(peaks, tracks.links)
     here = seen.at(sites.index)
     modulation = emissions.first_modulation(here, model)
     floor = np.full(model.channels, 0.03, np.float32)
@@ -92,9 +96,9 @@ def decide(found: Found, model: PatternModel, clock: Stages) -> Decision:
         sure = np.where(path >= 0, posterior[np.arange(len(path)), np.maximum(path, 0)], 0).astype(np.float32)
         needed = confidence_needed(here, model)
         decided = np.where((path == along) & (sure >= needed), path, -1).astype(np.int32)
-        label, confidence = linking.between_sites(decided, sure, sites, chains)
-        long_enough = np.repeat(chains.lengths * stripes.STEP >= MIN_CHAIN_PX, chains.lengths)
-        label[chains.order[~long_enough]] = -1
+        label, confidence = linking.between_sites(decided, sure, sites, tracks.links, tracks.joined)
+        long_enough = tracks.chains.lengths * stripes.STEP >= MIN_CHAIN_PX
+        label[tracks.links.order[~np.repeat(long_enough, tracks.links.lengths)]] = -1
         label[found.beyond] = -1
     with clock.stage("agreement"):
         agrees = description.agreement(here, evidence, model, modulation, path, (sites.start, gap))
@@ -112,6 +116,7 @@ def decide(found: Found, model: PatternModel, clock: Stages) -> Decision:
         "window_px": size,
         "agreement": {key: np.round(value, 4).tolist() for key, value in asdict(agrees).items()},
         "peaks": len(peaks),
+        "joined_tracks": int(tracks.joined.sum()),
         "peaks_decided": int((label >= 0).sum()),
         "thresholds": {
             "decided": DECIDED,
@@ -120,7 +125,8 @@ def decide(found: Found, model: PatternModel, clock: Stages) -> Decision:
             "height_share": stripes.HEIGHT_FLOOR,
         },
     }
-    return Decision(label, confidence, np.maximum(seen.light, 0), fine, agrees, median(scale_field), figures)
+    light = np.where(tracks.broken, MEAN_LIGHT * peaks.height, np.maximum(seen.light, 0))
+    return Decision(label, confidence, light, fine, agrees, median(scale_field), figures)
 
 
 def confidence_needed(seen: emissions.Amplitudes, model: PatternModel) -> Array:

@@ -175,7 +175,7 @@ def _see_anew(upright: Image, model: PatternModel, camera: CameraFormat) -> _See
 
 
 def _learnt(found: Found, decided: Decision, *, upside_down: bool) -> Known:
-    peaks, _, _, search = found.parts()
+    peaks, _, _, _, search = found.parts()
     label = decided.label
     follow = (label[:-1] >= 0) & (label[1:] == label[:-1] + 1)
     spacing = np.diff(peaks.y)[follow]

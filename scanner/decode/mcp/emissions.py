@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode.mcp.exponentials import exp_of, log_of
-from scanner.decode.mcp.linking import Chains
 from scanner.decode.mcp.magnification import FIELD_STEP
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.ranks import median, quantiles
 from scanner.decode.mcp.stripes import STEP
+from scanner.decode.mcp.tracks import Tracks
 from scanner.kernel import contracting_kernel, kernel, summing_kernel
 
 Array = NDArray[np.float32]
@@ -51,7 +51,7 @@ OUTLIER = 0.01
 @dataclass(frozen=True, eq=False)
 class Amplitudes:
     """ratio: (P, N) float32, carrier amplitude over brightness. sigma: (P, N) float32, its noise (one component).
-    light: (P,) float32, brightness above the valleys in the window.
+    light: (P,) float32, brightness above the valleys in the window; about 1 on joined tracks.
     """
 
     ratio: Array
@@ -63,23 +63,25 @@ class Amplitudes:
         return Amplitudes(self.ratio[index], self.sigma[index], self.light[index])
 
 
-def measure(light: Array, chains: Chains, field: Array, model: PatternModel, scale: float, size: int) -> Amplitudes:
+def measure(light: Array, tracks: Tracks, field: Array, model: PatternModel, scale: float, size: int) -> Amplitudes:
     """Carrier amplitudes at every peak.
 
     Args:
-        light: (4 P,) float32, brightness along the chains.
-        chains: the chains.
-        field: (P,) magnification relative to `scale` at each peak.
+        light: (4 N,) float32, brightness along the tracks.
+        tracks: where it was read.
+        field: (N,) magnification relative to `scale` at each place.
         model: the pattern's tables.
         scale: camera px per projector px.
-        size: window, samples, a multiple of four. Chains shorter than it are fitted whole.
+        size: window, samples, a multiple of four; twice that on joined tracks, where lines of the print stand between
+            the carriers. Shorter tracks are fitted whole.
 
     Returns:
-        Amplitudes in the order of the peaks.
+        Amplitudes in the order of the P peaks.
     """
     count, channels = len(field), model.channels
     omega = tuple(float(w) for w in 2 * np.pi * model.carriers.astype(np.float64) / scale)
-    of_chain = np.minimum(chains.lengths * STEP, size)
+    chains = tracks.chains
+    of_chain = np.minimum(chains.lengths * STEP, size * (1 + tracks.joined)).astype(np.int32)
     of_peak = np.empty(count, np.int32)
     of_peak[chains.order] = np.repeat(of_chain, chains.lengths)
     pick = np.rint((field - 1) / FIELD_STEP).astype(np.int32)
@@ -97,11 +99,12 @@ def measure(light: Array, chains: Chains, field: Array, model: PatternModel, sca
         tables = [_table(omega, int(step), int(length)) for step in steps]
         chosen = np.flatnonzero(of_chain == length).astype(np.int32)
         basis, inverse = np.stack([t[0] for t in tables]), np.stack([t[1] for t in tables])
-        shortness = np.float32((size / length) ** SHORT_POWER)
+        shortness = np.float32(max(size / length, 1) ** SHORT_POWER)
         hop = max(1, int(length) // (8 * STEP))
         links = (chains.order, chains.start, chosen, pick)
         _fit(light, *links, basis, inverse, _window(int(length)), shortness, hop, ratio, sigma, bright)
-    return Amplitudes(ratio, sigma, bright)
+    seen = Amplitudes(ratio, sigma, bright)
+    return seen.at(tracks.place) if tracks.joined.any() else seen
 
 
 @lru_cache(maxsize=256)

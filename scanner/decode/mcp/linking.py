@@ -134,34 +134,56 @@ def sites_of(peaks: Peaks, chains: Chains) -> Sites:
     return Sites(index, np.concatenate(([0], np.cumsum(counts))).astype(np.int32), left)
 
 
-def between_sites(label: Ints, confidence: Array, sites: Sites, chains: Chains) -> tuple[Ints, Array]:
+def between_sites(
+    label: Ints, confidence: Array, sites: Sites, chains: Chains, joined: NDArray[np.bool_]
+) -> tuple[Ints, Array]:
     """What the sites were decoded as, for all peaks: a peak between two sites of its chain needs both to agree.
+
+    Where print breaks stripes up, sites are undecided here and there: on joined tracks one decided site is enough
+    beside an undecided one.
 
     Args:
         label: (M,) int32, -1 undecided.
         confidence: (M,) float32.
         sites: the sites.
-        chains: of all P peaks.
+        chains: of all P peaks; one may be a track of several pieces.
+        joined: (C,) bool, which are.
 
     Returns:
         label (P,) int32 and confidence (P,) float32.
     """
     every, sure = np.full(len(chains.order), -1, np.int32), np.zeros(len(chains.order), np.float32)
     every[sites.index], sure[sites.index] = label, confidence
-    _between_sites(chains.order, chains.start, chains.column, every, sure)
+    _between_sites(chains.order, chains.start, chains.column, joined, every, sure)
     return every, sure
 
 
 @kernel
-def _between_sites(order: Ints, start: Ints, column: Ints, label: Ints, confidence: Array) -> None:
+def _next_site(order: Ints, column: Ints, p: int, way: int, end: int) -> int:
+    """The peak of an even column next to place p, before place `end`; -1 for none."""
+    q = p + way
+    while q != end and column[order[q]] % 2:
+        q += way
+    return order[q] if q != end else -1
+
+
+@kernel
+def _between_sites(
+    order: Ints, start: Ints, column: Ints, joined: NDArray[np.bool_], label: Ints, confidence: Array
+) -> None:
     for c in range(len(start) - 1):
         for p in range(start[c], start[c + 1]):
             k = order[p]
             if column[k] % 2 == 0:
                 continue
-            a = order[p - 1] if p > start[c] else order[min(p + 1, start[c + 1] - 1)]
-            b = order[p + 1] if p + 1 < start[c + 1] else a
-            if a != k and label[a] == label[b]:
+            a = _next_site(order, column, p, -1, start[c] - 1)
+            b = _next_site(order, column, p, 1, start[c + 1])
+            a, b = b if a < 0 else a, a if b < 0 else b
+            if a < 0:
+                continue
+            if joined[c]:
+                a, b = b if label[a] < 0 else a, a if label[b] < 0 else b
+            if label[a] == label[b]:
                 label[k] = label[a]
                 confidence[k] = min(confidence[a], confidence[b])
 

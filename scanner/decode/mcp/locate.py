@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.mcp import carriers, linking, stripes
+from scanner.decode.mcp import carriers, linking, magnification, stripes
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.ranks import quantiles
+from scanner.decode.mcp.tracks import Tracks, join
 from scanner.patterns import CameraFormat
 
 Array = NDArray[np.float32]
@@ -76,16 +77,20 @@ class Found:
     beyond: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
     peaks: stripes.Peaks | None = None
     chains: linking.Chains | None = None
+    tracks: Tracks | None = None
     signals: carriers.Signals | None = None
     search: carriers.CarrierSearch | None = None
 
-    def parts(self) -> tuple[stripes.Peaks, linking.Chains, carriers.Signals, carriers.CarrierSearch]:
+    def parts(
+        self,
+    ) -> tuple[stripes.Peaks, linking.Chains, Tracks, carriers.Signals, carriers.CarrierSearch]:
         """What a search without a fault has found."""
         assert self.peaks is not None  # noqa: S101  (no fault means that the search went to its end)
         assert self.chains is not None  # noqa: S101
+        assert self.tracks is not None  # noqa: S101
         assert self.signals is not None  # noqa: S101
         assert self.search is not None  # noqa: S101
-        return self.peaks, self.chains, self.signals, self.search
+        return self.peaks, self.chains, self.tracks, self.signals, self.search
 
 
 @dataclass(frozen=True)
@@ -170,13 +175,19 @@ def _search(found: Found, image: Image, model: PatternModel, camera: CameraForma
         found.even = 1 / EVEN < stripes.spacing(found.peaks) / found.pitch < EVEN
     with clock.stage("chains"):
         found.chains = linking.link(found.peaks, found.pitch)
-        found.beyond = linking.silhouettes(found.reduced, found.peaks, found.chains)
-        if found.beyond.any() and carriers.are_short(found.chains, model, around):
+        beyond = np.zeros(0, np.bool_)
+        if carriers.are_short(found.chains, model, around):
+            beyond = linking.silhouettes(found.reduced, found.peaks, found.chains)
+        if beyond.any():
             # Of a narrow object what smoothing draws out past its edges is too large a share.
-            found.peaks = found.peaks.where(~found.beyond)
-            found.beyond = np.zeros(len(found.peaks), np.bool_)
+            found.peaks = found.peaks.where(~beyond)
             found.chains = linking.link(found.peaks, found.pitch)
-        found.signals = carriers.signals_along(image, found.peaks, found.chains, found.pitch, camera.max_value)
+        long = magnification.window_px(model, around) // stripes.STEP
+        found.tracks = join(found.peaks, found.chains, found.pitch, long)
+        found.beyond = np.zeros(len(found.peaks), np.bool_)
+        if not beyond.any():
+            found.beyond = linking.silhouettes(found.reduced, found.peaks, found.tracks.links)
+        found.signals = carriers.signals_along(image, found.tracks, found.pitch, longest, camera.max_value)
     if len(found.peaks) == 0:
         found.fault = "no stripes stand out of the noise"
         return found
@@ -184,7 +195,7 @@ def _search(found: Found, image: Image, model: PatternModel, camera: CameraForma
         return found
     with clock.stage("carriers"):
         found.search = carriers.search_carriers(
-            found.signals, found.peaks, found.chains, model, around, (image.shape[0], image.shape[1])
+            found.signals, found.tracks, model, around, (image.shape[0], image.shape[1])
         )
     found.contrast = float(np.exp(np.log(np.maximum(found.search.contrast, 0.1)).mean()))
     if found.contrast < MIN_CONTRAST:

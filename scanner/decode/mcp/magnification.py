@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode.mcp.carriers import CarrierSearch, places
-from scanner.decode.mcp.linking import Chains
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.ranks import quantiles
-from scanner.decode.mcp.stripes import STEP, Peaks
+from scanner.decode.mcp.stripes import STEP
+from scanner.decode.mcp.tracks import Tracks
 from scanner.kernel import summing_kernel
 
 Array = NDArray[np.float32]
@@ -43,26 +43,26 @@ def window_px(model: PatternModel, scale: float) -> int:
 
 def fit_field(
     light: Array,
-    peaks: Peaks,
-    chains: Chains,
+    tracks: Tracks,
     model: PatternModel,
     search: CarrierSearch,
     size: int,
     shape: tuple[int, int],
 ) -> Array:
-    """The magnification at each peak.
+    """The magnification at each place of the tracks.
 
     Args:
-        light: (4 P,) float32.
-        peaks, chains, model: as elsewhere.
+        light: (4 N,) float32, along the tracks.
+        tracks, model: as elsewhere.
         search: mean magnification and its drift.
         size: window, samples.
         shape: (H, W) px.
 
     Returns:
-        (P,) float32: magnification relative to `search.scale`.
+        (N,) float32: magnification relative to `search.scale`.
     """
-    x, y = places(peaks, chains, shape)
+    x, y = places(tracks, shape)
+    chains = tracks.chains
     base = search.relative(x, y) - 1
     hop = max(1, size // (2 * STEP))
     windows = np.maximum((chains.lengths - size // STEP) // hop + 1, 0)
