@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from scanner.capture import FrameRecord
 from scanner.clock import Clock
-from scanner.devices import CameraFrame, Flip, Pixels, TriggerMode
+from scanner.devices import CameraFrame, Flip, KnowsPresence, Pixels, TriggerMode
 from scanner.errors import DeviceLost
 from scanner.patterns import PatternSequence
 from scanner.sequencer.plan import Mode, Plan
@@ -21,6 +21,9 @@ from scanner.sequencer.verify import judge
 
 PATIENCE = 3
 """Frames in a row that may stay away before the camera counts as lost: each had its time and half a second."""
+
+LOOK_NS = 500_000_000
+"""From one look at the projector to the next: nothing else is asked of it, and frames come without its light too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +69,13 @@ def endless(
     triggered = plan.mode is Mode.SOFTWARE
     camera.start(TriggerMode.SOFTWARE if triggered else TriggerMode.FREE)
     steady, absent, lost = Steady(plan, flip), 0, 0
+    looked_ns = clock.now_ns()
     try:
         while not cancelled():
+            if clock.now_ns() - looked_ns >= LOOK_NS:
+                looked_ns = clock.now_ns()
+                if isinstance(rig.projector, KnowsPresence):
+                    rig.projector.check_present()
             if triggered:
                 camera.trigger()
             frame = camera.pop(plan.pop_timeout_ns)

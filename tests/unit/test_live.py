@@ -29,11 +29,12 @@ from scanner.series import read_series, recording_at, segment_name
 from scanner.stream import LiveBegin, LiveCounts, LiveFrame
 from scanner.wire_images import LiveHeader, encode_image
 from service.commands.live import figures, sent_points
-from service.live_files import close_recording, recorded_files, reserve
+from service.live_files import close_recording, reserve
 from service.live_series import LiveSeries, LiveTotals
 from service.live_storage import FrameRing, Recording, ring_slots
 from service.live_work import LiveWork
 from service.pipe import Kept, Shot
+from service.series import recorded_files
 from service.spool import Limits, Spool
 
 MCP = McpPattern(bits=2, carriers=(20.0, 34.0), codes=(0, 1, 2, 3))
@@ -53,6 +54,23 @@ def rig(clock: VirtualClock, mode: TriggerMode | None = None, **camera: Any) -> 
     )
     size = found.projector.capabilities
     return found, PatternSequence(ProjectorSize(size.width, size.height), MCP)
+
+
+def test_a_projector_that_goes_away_ends_the_run_although_the_camera_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = VirtualClock()
+    here, sequence = rig(clock)
+    unplugged_ns = clock.now_ns() + 600_000_000
+
+    def check() -> None:
+        if clock.now_ns() > unplugged_ns:
+            raise DeviceLost("the display went away", device="screen")
+
+    monkeypatch.setattr(here.projector, "check_present", check, raising=False)
+    with pytest.raises(DeviceLost, match="display went away"):
+        list(endless(here, here.plan(sequence), sequence, clock, lambda: False))
+    assert unplugged_ns <= clock.now_ns() < unplugged_ns + 1_000_000_000, "noticed within a second"
+    here.camera.close()
+    here.projector.close()
 
 
 @pytest.mark.parametrize("mode", [None, TriggerMode.SOFTWARE])
