@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 
 FORMAT = "fringed-calibration"
 VERSION = 1
+_MAKE = "take a file as fringed calibrate run or solve writes it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,9 +166,9 @@ def load_calibration(path: Path) -> Calibration:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise CalibrationError(f"cannot read calibration {path}: {error.strerror}") from error
+        raise CalibrationError(f"cannot read calibration {path}: {error.strerror}", hint=_MAKE) from error
     except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"{path} is not JSON: {error}") from error
+        raise CalibrationError(f"{path} is not JSON: {error}", hint=_MAKE) from error
     found = calibration_from_dict(content, name=str(path))
     # Errors say where the file is; warnings go into reports, which are read elsewhere.
     return replace(found, warnings=tuple(said.replace(str(path), path.name) for said in found.warnings))
@@ -277,15 +278,21 @@ def _lens_dict(lens: Lens) -> dict[str, Any]:
 
 def _lens(content: Any, name: str) -> Lens:
     if not isinstance(content, dict):
-        raise CalibrationError(f"{name} is missing")
+        raise CalibrationError(f"{name} is missing", hint=_MAKE)
     size = content.get("size")
     if not (isinstance(size, list) and len(size) == 2 and all(type(n) is int and n > 0 for n in size)):
         raise CalibrationError(f"{name}.size must be [width, height] in pixels, got {size!r}")
     matrix = _matrix(content.get("matrix"), (3, 3), f"{name}.matrix")
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or abs(np.linalg.det(matrix)) < 1e-9:
-        raise CalibrationError(f"{name}.matrix is singular or has a focal length that is not positive")
+        raise CalibrationError(
+            f"{name}.matrix is singular or has a focal length that is not positive",
+            hint=f"[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels; {_MAKE}",
+        )
     if np.abs(matrix[1, 0]) > 0 or np.abs(matrix[2] - (0, 0, 1)).max() > 0:
-        raise CalibrationError(f"{name}.matrix must be upper triangular with last row 0 0 1")
+        raise CalibrationError(
+            f"{name}.matrix must be upper triangular with last row 0 0 1",
+            hint="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels; was it written by columns?",
+        )
     distortion = _matrix(content.get("distortion", [0.0] * 5), (5,), f"{name}.distortion")
     return Lens((size[0], size[1]), matrix, distortion)
 
@@ -338,13 +345,13 @@ def _check_optional(content: Mapping[str, Any], name: str) -> None:
 
 def _matrix(content: Any, shape: tuple[int, ...], name: str) -> Array:
     if content is None:
-        raise CalibrationError(f"{name} is missing")
+        raise CalibrationError(f"{name} is missing", hint=_MAKE)
     try:
         array = np.asarray(content, dtype=np.float64)
     except (ValueError, TypeError, OverflowError) as error:
-        raise CalibrationError(f"{name} is not an array of numbers") from error
+        raise CalibrationError(f"{name} is not an array of numbers", hint=_MAKE) from error
     if array.shape != shape:
-        raise CalibrationError(f"{name} has shape {array.shape}, expected {shape}")
+        raise CalibrationError(f"{name} has shape {array.shape}, expected {shape}", hint=_MAKE)
     if not np.isfinite(array).all():
-        raise CalibrationError(f"{name} contains NaN or infinity")
+        raise CalibrationError(f"{name} contains NaN or infinity", hint=f"a calibration that failed: {_MAKE}")
     return array

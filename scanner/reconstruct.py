@@ -186,6 +186,7 @@ class Reconstruction:
         """Maps and points; `points` is told when the frames are checked, too."""
         tell("decoding")
         decoded = self._decoded()
+        decoded = replace(decoded, warnings=(*decoded.warnings, *capture.warnings))
         require_codes_within(decoded, self._header.sequence)
         if len(self._header.sequence) > 1:
             # The witnesses have seen light: without it the check ends in an error of its own.

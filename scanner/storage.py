@@ -227,7 +227,10 @@ def storage_errors(path: Path) -> Iterator[None]:
         errno.ENOSPC: "the disk is full: free some space",
         errno.EDQUOT: "the quota is used up: free some space",
         errno.EACCES: "this user may not write there",
+        errno.EPERM: "this user may not write there",
         errno.EROFS: "the file system is read-only",
+        errno.ENOENT: "nothing can be made there: give a place on a disk",
+        errno.ENOTDIR: "a part of this path is a file: give another",
         errno.EMFILE: "too many open files: raise the limit (ulimit -n)",
     }
     try:

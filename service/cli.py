@@ -20,6 +20,8 @@ INTERRUPTED = 130
 # Processes are what shares processors out here. OpenBLAS's own threads spin while they wait for one another: beside
 # other work a calibration of a second takes fifteen. Children inherit it; NumPy reads it when it is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# What OpenCV warns of (a PNG that breaks off) comes back to the caller too, and our error names the file.
+os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -45,6 +45,7 @@ class Capture:
         self.path = path
         self.header = header
         self.all_records = tuple(records or ())
+        self._colours: dict[bool, str] = {}  # an image file by whether it is in colour
         self._slots = None if header.frames is not None else _map_frames(path, header)
         self._records = self._present(records, checked or {})
 
@@ -93,20 +94,39 @@ class Capture:
         name = self.header.calibration
         return _inside(self.path, name) if name is not None and name.endswith(".json") else None
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the frames that were read are not, and need not be, but had better be."""
+        if True not in self._colours:
+            return ()
+        return (f"the frames are colour images ({self._colours[True]}): read as luma, grey ones measure better",)
+
     def frame(self, pattern: int) -> Pixels:
         """The frame of a pattern index: (height, width) uint8 or uint16, a read-only view where possible.
 
         Raises:
             KeyError: not here.
-            DecodeError: unreadable, or of another size or depth than capture.json says.
+            DecodeError: unreadable, of another size or depth than capture.json says, or in colour where others are not.
         """
         slot = self._records[pattern].slot
         if self.header.frames is not None:
-            return _read_image(_inside(self.path, self.header.frames[pattern]), self.header.camera)
+            name = self.header.frames[pattern]
+            image = _read_image(_inside(self.path, name))
+            self._require_alike(name, colour=image.ndim == 3)
+            return _grey(image, self.header.camera, str(self.path / name))
         if slot is None or self._slots is None:
             raise KeyError(pattern)
         frame: Pixels = self._slots[slot]
         return _within_range(frame, self.header.camera, f"{self.path / FRAMES_FILE}, slot {slot}")
+
+    def _require_alike(self, name: str, *, colour: bool) -> None:
+        """Luma is not what a grey frame has: phases made of both would be wrong, and look right."""
+        self._colours.setdefault(colour, name)
+        if len(self._colours) > 1:
+            raise DecodeError(
+                f"{self.path}: frame {self._colours[True]} is in colour, frame {self._colours[False]} is grey",
+                hint="save all frames alike, grey ones rather, as the camera gives them",
+            )
 
     def _present(self, records: Sequence[FrameRecord] | None, checked: Mapping[int, str]) -> dict[int, FrameRecord]:
         count = self.header.frame_count
@@ -172,10 +192,12 @@ def _map_frames(folder: Path, header: CaptureHeader) -> NDArray[Any] | None:
     shape, dtype, offset = _read_npy_header(path)
     if shape[1:] != camera.shape:
         raise DecodeError(
-            f"{path}: frames of {shape[2]} x {shape[1]}, capture.json says {camera.width} x {camera.height}"
+            f"{path}: frames of {shape[2]} x {shape[1]}, capture.json says {camera.width} x {camera.height}",
+            hint="write the frames' own width and height under camera in capture.json, or take the frames that belong "
+            "to it",
         )
     if dtype != camera.dtype:
-        raise DecodeError(f"{path}: frames are {dtype}, {camera.bits} bits need {camera.dtype}")
+        raise DecodeError(f"{path}: frames are {dtype}, {camera.bits} bits need {camera.dtype}", hint=_BITS)
     frame_bytes = camera.width * camera.height * dtype.itemsize
     whole = (path.stat().st_size - offset) // frame_bytes
     slots = whole if header.state == "open" else shape[0]
@@ -210,9 +232,13 @@ def _read_npy_header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
     return shape, dtype, offset
 
 
-def _read_image(path: Path, camera: CameraFormat) -> Pixels:
+_BITS = "camera.bits in capture.json: up to 8 for uint8, 9 to 16 for uint16"
+
+
+def _read_image(path: Path) -> NDArray[Any]:
+    """The pixels of a file: (height, width), or (height, width, 3) where it is in colour."""
     if not path.is_file():
-        raise DecodeError(f"frame {path} is missing")
+        raise DecodeError(f"frame {path} is missing", hint="copy it there, or correct frames in capture.json")
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -221,15 +247,22 @@ def _read_image(path: Path, camera: CameraFormat) -> Pixels:
     # OpenCV fills a JPEG that breaks off with grey and says nothing.
     if image is None or (content[:2] == b"\xff\xd8" and b"\xff\xd9" not in content[-64:]):
         raise DecodeError(f"frame {path} cannot be read as an image", hint="PNG, TIFF, PGM or BMP, 8 or 16 bit")
-    if image.ndim == 3:
-        image = image[..., 0] if image.shape[2] == 1 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
-    if image.shape != camera.shape:
+    if image.ndim == 2:
+        return np.asarray(image)
+    return np.asarray(image[..., 0] if image.shape[2] == 1 else image[..., :3])  # without alpha
+
+
+def _grey(image: NDArray[Any], camera: CameraFormat, name: str) -> Pixels:
+    """The frame that an image is, if it is one of this camera: luma of colour."""
+    if image.shape[:2] != camera.shape:
         raise DecodeError(
-            f"frame {path} is {image.shape[1]} x {image.shape[0]}, capture.json says {camera.width} x {camera.height}"
+            f"frame {name} is {image.shape[1]} x {image.shape[0]}, capture.json says {camera.width} x {camera.height}",
+            hint="all frames have the camera's size: take the one that belongs here, or correct camera in capture.json",
         )
     if image.dtype != camera.dtype:
-        raise DecodeError(f"frame {path} is {image.dtype}, {camera.bits} bits need {camera.dtype}")
-    return _within_range(np.asarray(image, dtype=camera.dtype), camera, str(path))
+        raise DecodeError(f"frame {name} is {image.dtype}, {camera.bits} bits need {camera.dtype}", hint=_BITS)
+    luma = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return _within_range(np.asarray(luma, dtype=camera.dtype), camera, name)
 
 
 def _within_range(frame: Pixels, camera: CameraFormat, name: str) -> Pixels:

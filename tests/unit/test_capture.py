@@ -192,13 +192,28 @@ def test_an_image_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pyt
         capture.frame(1)
 
 
+def in_colour(pixels: np.ndarray) -> np.ndarray:
+    return np.repeat(pixels[..., None], 3, axis=2)
+
+
 def test_image_files_are_read_colour_as_luma(tmp_path: Path) -> None:
-    grey = frame(1)
-    colour = np.repeat(frame(2)[..., None], 3, axis=2)
-    names = write_images(tmp_path / "c", [grey, colour, grey])
-    capture = Capture.open(image_capture(tmp_path / "c", names))
-    np.testing.assert_array_equal(capture.frame(0), grey)
-    np.testing.assert_array_equal(capture.frame(1), frame(2))
+    frames = [frame(1), frame(2), frame(3)]
+    grey = Capture.open(image_capture(tmp_path / "g", write_images(tmp_path / "g", frames)))
+    colour = Capture.open(image_capture(tmp_path / "c", write_images(tmp_path / "c", [in_colour(f) for f in frames])))
+    for index, pixels in enumerate(frames):
+        np.testing.assert_array_equal(grey.frame(index), pixels)
+        np.testing.assert_array_equal(colour.frame(index), pixels)
+    assert grey.warnings == ()
+    assert len(colour.warnings) == 1
+
+
+@pytest.mark.parametrize("odd", [0, 1])
+def test_colour_among_grey_is_refused_by_name(odd: int, tmp_path: Path) -> None:
+    frames = [in_colour(frame(n)) if n == odd else frame(n) for n in range(3)]
+    capture = Capture.open(image_capture(tmp_path / "c", write_images(tmp_path / "c", frames)))
+    with pytest.raises(DecodeError, match=rf"frame {odd}\.png is in colour, frame {1 - odd}\.png is grey") as caught:
+        [capture.frame(n) for n in range(3)]
+    assert "alike" in str(caught.value.hint)
 
 
 @pytest.mark.parametrize(

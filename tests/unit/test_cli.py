@@ -199,6 +199,12 @@ def test_the_command_line_starts_without_array_libraries() -> None:
     assert ran.stdout.strip() == "[]"
 
 
+def test_opencv_does_not_write_between_our_lines() -> None:
+    code = "import service.cli, cv2; assert cv2.imdecode(cv2.imencode('.png', cv2.UMat(9, 9, 0))[1][:60], 1) is None"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "", "")
+
+
 def test_shell_completion_is_offered() -> None:
     ran = subprocess.run(
         [*FRINGED, "--show-completion", "bash"], capture_output=True, text=True, check=True, env={**os.environ}
@@ -393,6 +399,11 @@ def test_an_output_folder_that_is_not_empty_is_refused(run: Run, tmp_path: Path)
         status, _, err = run("patterns", "gray", "--size", "8x8", "-o", place)
         assert status == 1
         assert "file" in err
+        assert "\nhint: " in err
+    status, _, err = run("patterns", "gray", "--size", "8x8", "-o", "/proc/there/images")
+    assert status == 1
+    assert "/proc/there" in err
+    assert "hint: nothing can be made there" in err
 
 
 # --- decode and audit ---------------------------------------------------------------------------------------------
@@ -456,6 +467,10 @@ def damage_image(folder: Path) -> None:
     (folder / "seen-003.png").write_bytes(b"\x89PNG\r\n\x1a\n")
 
 
+def one_in_colour(folder: Path) -> None:
+    cv2.imwrite(str(folder / "seen-003.png"), cv2.imread(str(folder / "seen-003.png"), cv2.IMREAD_COLOR))
+
+
 def wrong_size(folder: Path) -> None:
     cv2.imwrite(str(folder / "seen-003.png"), np.zeros((127, 160), np.uint8))
 
@@ -468,9 +483,10 @@ def change(**members: Any) -> Callable[[Path], Any]:
     ("harm", "said"),
     [
         (shutil.rmtree, "cannot read"),
-        (lambda folder: (folder / "seen-003.png").unlink(), "003.png"),
+        (lambda folder: (folder / "seen-003.png").unlink(), "003.png is missing\nhint: copy it there"),
         (damage_image, "003.png"),
-        (wrong_size, "003.png"),
+        (wrong_size, "take the one that belongs here"),
+        (one_in_colour, "seen-003.png is in colour, frame seen-000.png is grey"),
         (lambda folder: (folder / "capture.json").write_text("{"), "not JSON"),
         (change(format="something"), "fringed-capture"),
         (change(version=2), "version 2"),
@@ -490,6 +506,19 @@ def test_bad_captures_are_refused_and_leave_nothing(
     assert (status, out) == (1, "")
     assert said in err
     assert not (tmp_path / "out").exists()
+
+
+def test_frames_all_in_colour_are_read_as_luma_and_said_so_once(run: Run, capture: Path, tmp_path: Path) -> None:
+    assert run("decode", capture, "-o", "grey")[0] == 0
+    for path in capture.glob("seen-*.png"):
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_COLOR))
+    status, out, err = run("decode", capture, "-o", "colour", "--json")
+    assert status == 0, err
+    said = [warning for warning in json.loads(out)["report"]["warnings"] if "luma" in warning]
+    assert len(said) == 1
+    grey, colour = load_scan(tmp_path / "grey").rows, load_scan(tmp_path / "colour").rows
+    assert grey is not None
+    np.testing.assert_array_equal(grey, colour)
 
 
 def calibration(**changes: Any) -> dict[str, Any]:
@@ -527,6 +556,7 @@ def test_bad_calibrations_are_refused(changes: dict[str, Any], run: Run, capture
     status, _, err = run("decode", capture, "--calibration", bad, "-o", "deep/out")
     assert status == 1
     assert err.startswith("opening") or "error:" in err
+    assert "\nhint: " in err
     assert not (tmp_path / "deep").exists()
 
 
