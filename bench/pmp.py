@@ -2,9 +2,10 @@
 
     python bench/pmp.py [--size 1392x1040] [--bits 8] [--frequencies 1,8,64] [--shifts 8] [--runs 15] [--gray]
 
-For one thread and for as many as there are: ms to decode frames that are all at hand; ms a frame and after the last one
-where they come one by one; reading all frames once and writing two float32 maps; a decode with OpenCV and NumPy; and
-`fringes` (PyPI, mode "fast"), if it is installed. Frames rotate over several stacks, so that none is still in a cache
+For one thread and for as many as there are: ms to decode frames that are all at hand, to all maps (`finish`) and, of
+PMP, to rows and confidence alone (`coordinates`); ms a frame and after the last one where they come one by one; reading
+all frames once, and writing two float32 maps besides; a decode with OpenCV and NumPy; and `fringes` (PyPI, mode
+"fast"), if it is installed. Frames rotate over several stacks, so that none is still in a cache
 from the run before. Medians and least times; a decoder and its maps are made before its time runs, as in a scan.
 """
 
@@ -58,7 +59,7 @@ def main():
 
 def measure(kind, sequence, camera, stacks, runs, threads):
     """Print the rows of one number of threads."""
-    whole, adding, finishing, floor, decided = [], [], [], [], []
+    whole, brief, adding, finishing, floor, reading, decided = [], [], [], [], [], [], []
     for run in range(runs):
         decoder = kind(sequence, camera, threads=threads)
         frames = stacks[run % STACKS]
@@ -69,6 +70,9 @@ def measure(kind, sequence, camera, stacks, runs, threads):
         whole.append(time.perf_counter() - begin)
         decided.append(float(np.mean(found.reason == 0)))
         floor.append(read_and_write(stacks[(run + 2) % STACKS], threads))
+        reading.append(read_and_write(stacks[(run + 3) % STACKS], threads, maps=False))
+        if kind is pmp.PmpDecoder:
+            brief.append(coordinates_time(kind(sequence, camera, threads=threads), stacks[(run + 1) % STACKS]))
         decoder = kind(sequence, camera, threads=threads)
         begin = time.perf_counter()
         for position, frame in enumerate(stacks[(run + 1) % STACKS]):
@@ -80,25 +84,36 @@ def measure(kind, sequence, camera, stacks, runs, threads):
     name = "one thread" if threads == 1 else f"{threads} threads"
     print(f"{name}, {min(decided):.1%} decided")
     for label, times in (
-        ("all frames at hand", whole),
+        ("all frames at hand, all maps", whole),
+        ("rows and confidence", brief),
         ("one by one: a frame", adding),
         ("one by one: after the last", finishing),
         ("read once, write two maps", floor),
+        ("read once", reading),
     ):
-        ratio = f"   {np.median(times) / np.median(floor):5.2f} x the last row" if times is not floor else ""
-        print(f"  {label:28s}{1e3 * np.median(times):8.2f} ({1e3 * min(times):.2f}){ratio}")
+        if not times:
+            continue
+        to_floor, to_reading = (np.median(times) / np.median(other) for other in (floor, reading))
+        print(
+            f"  {label:30s}{1e3 * np.median(times):8.2f} ({1e3 * min(times):.2f})"
+            f"   {to_floor:5.2f} x read and write, {to_reading:5.2f} x read"
+        )
+
+
+def coordinates_time(decoder, frames):
+    """Seconds of a decode to rows and confidence."""
+    begin = time.perf_counter()
+    for position, frame in enumerate(frames):
+        decoder.keep(position, frame)
+    decoder.coordinates()
+    return time.perf_counter() - begin
 
 
 def measure_others(sequence, camera, stacks):
     """Print what others need for the same frames; one thread is theirs to choose."""
     ours = []
     for run in range(6):
-        decoder = pmp.PmpDecoder(sequence, camera)
-        begin = time.perf_counter()
-        for position, frame in enumerate(stacks[run % STACKS]):
-            decoder.keep(position, frame)
-        decoder.finish()
-        ours.append(time.perf_counter() - begin)
+        ours.append(coordinates_time(pmp.PmpDecoder(sequence, camera), stacks[run % STACKS]))
     others = {"OpenCV and NumPy": lambda frames: plain_decode(sequence.pattern, frames)}
     if importlib.util.find_spec("fringes") is not None:
         others['fringes, mode "fast"'] = decoder_of_fringes(sequence.pattern)
@@ -169,10 +184,10 @@ def read(words):
 _maps = {}
 
 
-def read_and_write(stack, threads):
-    """Seconds to read every frame once and to write two maps, where memory is already there."""
+def read_and_write(stack, threads, maps=True):
+    """Seconds to read every frame once and to write two maps (or none), where memory is already there."""
     words = stack.reshape(-1).view(np.uint64)
-    maps = _maps.setdefault(stack.shape[1:], np.full(2 * stack[0].size, 0, np.float32))
+    maps = _maps.setdefault(stack.shape[1:], np.full(2 * stack[0].size, 0, np.float32))[: None if maps else 0]
 
     def part(i):
         read(words[i * words.size // threads : (i + 1) * words.size // threads])

@@ -8,12 +8,13 @@ from the residual of the fit where a set has four shifts or more, else from how 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode import Decoded, Reason, neighbours
+from scanner.decode import Decoded, Map, Reason, neighbours
 from scanner.decode.agreement import disagreements
 from scanner.decode.frames import FrameCheck
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis
@@ -23,6 +24,17 @@ from scanner.decode.unwrapping import plan_ladder
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
 from scanner.patterns.description import Axis
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """What a scan is triangulated by and no more, (H, W) float32 each: as in `Decoded`."""
+
+    rows: Map | None
+    columns: Map | None
+    confidence: Map
+    warnings: tuple[str, ...]
+    """of frames that are missing or out of step"""
 
 
 class PmpDecoder:
@@ -109,6 +121,25 @@ class PmpDecoder:
         warnings += self._found[self._pattern.axes[0]].ladder.warnings()
         return self._decoded(warnings)
 
+    def coordinates(self) -> Coordinates:
+        """In place of `finish`: the same coordinates and confidence, in less time.
+
+        What is left out: sigma, albedo, modulation, and what a report says of ripple, overtones and flicker. A scan of
+        both axes is joined from all its maps, and takes as long as `finish`.
+
+        Raises:
+            DecodeError: as `finish`.
+        """
+        if len(self._pattern.axes) == 2:
+            whole = self.finish()
+            return Coordinates(whole.rows, whole.columns, whole.confidence, whole.warnings)
+        warnings, (axis,) = self._missing(), self._pattern.axes
+        found = self._decoded_axis(axis, brief=True)
+        shape = self._camera.shape
+        position, confidence = found.maps.position.reshape(shape), found.maps.confidence.reshape(shape)
+        rows, columns = (position, None) if axis == "y" else (None, position)
+        return Coordinates(rows, columns, confidence, warnings + disagreements(axis, found.remainders))
+
     def _took(self, fringe: int, frame: NDArray[Any]) -> None:
         self._frames[fringe] = frame
         # An axis that is whole before the last one's frames come is decoded in the meantime.
@@ -140,10 +171,13 @@ class PmpDecoder:
         return tuple(warnings)
 
     def _decode(self, axis: Axis) -> None:
+        self._found[axis] = self._decoded_axis(axis, brief=False)
+
+    def _decoded_axis(self, axis: Axis, brief: bool) -> AxisFound:
         frames = axis_frames(self._pattern, axis, self._frames)
-        self._found[axis] = decode_axis(
+        return decode_axis(
             self._pattern, self._sequence.projector.along(axis), self._camera, frames,
-            self._maps[axis], self._thresholds, self._threads,
+            self._maps[axis], self._thresholds, self._threads, brief=brief,
         )  # fmt: skip
 
     # --- the result ---------------------------------------------------------------------------------------------

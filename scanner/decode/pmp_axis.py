@@ -149,10 +149,12 @@ def decode_axis(
     thresholds: PmpThresholds,
     threads: int,
     ladder: Ladder | None = None,
+    brief: bool = False,
 ) -> AxisFound:
     """Decode one axis into `maps`.
 
     Args:
+        brief: write position, confidence and reason alone, and tell neither ripple, light nor `random_px`.
         along: projector pixels along the axis. threads: that share the pass. ladder: the way up to the finest set;
             None: as `plan_ladder` finds it.
     """
@@ -163,17 +165,18 @@ def decode_axis(
     ladder = ladder or plan_ladder(pattern.frequencies, frames.gains)
     sample = take_sample(frames, pixels, camera.max_value, t.clip(camera), t.min_modulation_levels)
     least = max(t.min_modulation_levels, t.min_modulation_share * sample.brightest(finest))
-    sample, light = judge_light(sample, frames, pattern.frequencies, along, least, t.min_modulation_sigmas)
+    sample, light = judge_light(sample, frames, pattern.frequencies, along, least, t.min_modulation_sigmas, not brief)
     noise = sample.noise(ladder, centre, least, t.min_modulation_sigmas)
     judged = sample.judged(noise, least, t.min_modulation_sigmas)
     remainders = judged.agreement(ladder, centre, t.phase_floor_cycles)
     per_cycle = along / float(ladder.frequencies[-1])
-    random_px = per_cycle * judged.phase_sigma(finest)
-    light = judge_ripple(
-        light, frames, sample, pixels, t.clip(camera), ladder, noise, centre, along, least, t.min_modulation_sigmas
-    )
-    ripple = None
-    if remainders and remainders[-1].pixels >= MIN_PIXELS:
+    random_px, ripple = np.nan, None
+    if not brief:
+        random_px = per_cycle * judged.phase_sigma(finest)
+        light = judge_ripple(
+            light, frames, sample, pixels, t.clip(camera), ladder, noise, centre, along, least, t.min_modulation_sigmas
+        )
+    if not brief and remainders and remainders[-1].pixels >= MIN_PIXELS:
         ripple = _ripple(remainders[-1], float((ladder.errors[-1] ** 2).sum()), per_cycle, random_px)
     f32 = partial(np.array, dtype=np.float32)
     errors2 = ladder.errors**2
@@ -189,7 +192,8 @@ def decode_axis(
              1 - t.min_unwrap_probability, t.edge_sigmas]),
         ladder.periodic, finest,
     )  # fmt: skip
-    out = (maps.position, maps.sigma, maps.confidence, maps.albedo, maps.modulation, maps.reason)
+    sigma, albedo, modulation = (m[: 0 if brief else None] for m in (maps.sigma, maps.albedo, maps.modulation))
+    out = (maps.position, sigma, maps.confidence, albedo, modulation, maps.reason)
 
     def decode(begin: int, end: int) -> NDArray[np.int64]:
         counts = np.zeros(REASONS, np.int64)

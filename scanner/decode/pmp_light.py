@@ -68,13 +68,20 @@ class Light:
 
 
 def judge_light(
-    sample: Sample, frames: AxisFrames, frequencies: Sequence[float], along: int, least: float, sigmas: float
+    sample: Sample,
+    frames: AxisFrames,
+    frequencies: Sequence[float],
+    along: int,
+    least: float,
+    sigmas: float,
+    tell: bool,
 ) -> tuple[Sample, Light]:
     """The sample without what overtones are of its residuals, and what is to be told of the light.
 
     Args:
         frequencies: by set, cycles over the projector. along: its pixels along the axis.
         least, sigmas: modulation a pixel must have to be asked, in grey levels and over its noise.
+        tell: False where nobody asks for the light: there is nothing in it then.
     """
     good = sample.lit(least, sigmas)
     spectra = spectra_of(frames, sample.runs, THINNED, good, sample.mean)
@@ -90,6 +97,8 @@ def judge_light(
         variance = float(residual[good].mean()) / max(frames.freedom, 1)
         prior = energy / max(MOST_EXPLAINED * variance, 1e-6) - frames.freedom
         sample = replace(sample, residual=residual, prior=max(PRIOR_FREEDOM, prior), overtones=energy)
+    if not tell:
+        return sample, Light((), None)
     told = (
         told_of(float(frequency), shifts, spectrum, variance, count)
         for frequency, shifts, spectrum in zip(frequencies, frames.shifts, spectra, strict=True)

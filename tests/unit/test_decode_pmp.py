@@ -468,6 +468,28 @@ def test_threads_and_borrowed_frames_make_no_difference(axes, size):
     assert sum(expected.details["counts"].values()) == camera.width * camera.height
 
 
+@pytest.mark.parametrize("axes", [("y",), ("x",), ("x", "y")])
+@pytest.mark.parametrize("frequencies", [(1.0, 8.0, 40.0), (59.0, 64.0, 70.0)])
+def test_coordinates_alone_are_those_of_all_maps(axes, frequencies):
+    camera = CameraFormat(203, 97)
+    pattern = PmpPattern(axes, frequencies, (8, 4, 3))
+    frames = render(pattern, camera, noise=5.0, albedo=0.05 + 0.7 * np.mgrid[: camera.height, : camera.width][1] / 203)
+    frames[2] = None
+    sequence = PatternSequence(PROJECTOR, pattern)
+    brief, full = PmpDecoder(sequence, camera), PmpDecoder(sequence, camera)
+    for position, frame in enumerate(frames):
+        if frame is not None:
+            brief.keep(position, frame)
+            full.keep(position, frame)
+    found, expected = brief.coordinates(), full.finish()
+    assert expected.details["counts"].get("value", 0) > 1000
+    for name in ("rows", "columns", "confidence"):
+        a, b = getattr(found, name), getattr(expected, name)
+        assert (a is None and b is None) or np.array_equal(a, b, equal_nan=True)
+    assert set(found.warnings) <= set(expected.warnings)
+    assert any("missing: 2" in warning for warning in found.warnings)
+
+
 def test_strips_cover_every_pixel_once():
     for pixels, threads in ((1, 2), (MIN_STRIP + 1, 2), (10 * MIN_STRIP - 3, 3), (100_000, 1)):
         strips = sorted(in_strips(lambda begin, end: (begin, end), pixels, threads))
