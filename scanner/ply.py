@@ -27,8 +27,8 @@ VERTEX = np.dtype(
 )
 """One vertex in the file, 31 bytes, unpadded."""
 
-PART_LINES = 64
-"""Of the cloud, packed and written at once: some megabytes, still in the cache when they are written"""
+PART_LINES = 32
+"""Of the cloud, packed and written at once: a megabyte or two, still in the cache when it is written"""
 
 _TYPES = {"f": "float", "u": "uchar"}
 
@@ -48,12 +48,13 @@ def write_cloud(
 ) -> None:
     """Write the points of an organised cloud, each part of it as soon as it is packed; see `vertices_of`.
 
+    What is written lies in one buffer, which changes from part to part.
+
     Raises:
         ValueError: as `write_ply`.
     """
-    vertices = _room(xyz)
-    file.write(_header(len(vertices), comments))
-    for part in _packed(vertices, xyz, normals, albedo, confidence):
+    file.write(_header(_count(xyz), comments))
+    for part in _packed(xyz, normals, albedo, confidence):
         file.write(bytes_of(part))
 
 
@@ -64,27 +65,23 @@ def vertices_of(xyz: Map, normals: Map, albedo: Map, confidence: Map) -> NDArray
         xyz, normals: (H, W, 3) float32; pixels whose xyz is NaN are left out.
         albedo, confidence: (H, W) float32.
     """
-    vertices = _room(xyz)
-    for _ in _packed(vertices, xyz, normals, albedo, confidence):
-        continue
+    vertices = np.empty(_count(xyz), VERTEX)
+    _pack(xyz, normals, albedo, _scale_of_grey(albedo, xyz), confidence, 0, len(xyz), vertices)
     return vertices
 
 
-def _room(xyz: Map) -> NDArray[np.void]:
-    return np.empty(xyz.shape[0] * xyz.shape[1] - int(np.count_nonzero(np.isnan(xyz[..., 2]))), VERTEX)
+def _count(xyz: Map) -> int:
+    return int(np.count_nonzero(~np.isnan(xyz[..., 2])))
 
 
-def _packed(
-    vertices: NDArray[np.void], xyz: Map, normals: Map, albedo: Map, confidence: Map
-) -> Iterator[NDArray[np.void]]:
-    """Fill `vertices`, `PART_LINES` lines of the cloud after another; yields what was filled."""
+def _packed(xyz: Map, normals: Map, albedo: Map, confidence: Map) -> Iterator[NDArray[np.void]]:
+    """`PART_LINES` lines of the cloud after another, in the same buffer."""
     scale = _scale_of_grey(albedo, xyz)
-    done = 0
+    vertices = np.empty(PART_LINES * xyz.shape[1], VERTEX)
     for begin in range(0, xyz.shape[0], PART_LINES):
         end = min(begin + PART_LINES, xyz.shape[0])
-        count = _pack(xyz, normals, albedo, scale, confidence, begin, end, vertices[done:])
-        yield vertices[done : done + count]
-        done += count
+        count = _pack(xyz, normals, albedo, scale, confidence, begin, end, vertices)
+        yield vertices[:count]
 
 
 def warm_up() -> None:

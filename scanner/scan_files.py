@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -151,12 +152,14 @@ class ScanWriter:
         assert scan.xyz is not None  # noqa: S101  only called with points
         assert normals is not None  # noqa: S101
         room = int(np.count_nonzero(scan.valid)) * VERTEX.itemsize + _HEADER_ROOM
-        with (
-            self._timed(f"write {CLOUD_FILE}"),
-            replacing(self._folder / CLOUD_FILE, self._digests, room=room) as file,
-        ):
+        path = self._folder / CLOUD_FILE
+        with self._timed(f"write {CLOUD_FILE}"), replacing(path, room=room) as file:
             comments = ("fringed; mm, camera frame: x right, y down, z forward",)
             write_cloud(file, scan.xyz, normals, scan.albedo, scan.confidence, comments)
+        if self._digests is not None:
+            with path.open("rb") as written:  # of the file: the buffer it was written from holds its last part alone
+                content = mmap(written.fileno(), 0, access=ACCESS_READ)
+            self._digests.begin(CLOUD_FILE, [content])
 
     def _write_picture(self, name: str, draw: Draw, scan: Scan, progress: Progress | None) -> None:
         with self._timed(f"write {name}"):
