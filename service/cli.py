@@ -30,6 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Both belong to the whole program: they hold wherever they stand.
     debug, as_json = "--debug" in words, "--json" in words
     words = [word for word in words if word != "--debug"] or ["--help"]
+    if words[0] == "--json" and len(words) > 1:
+        words = [*words[1:], "--json"]
     try:
         with _signals():
             with _interrupts_at_once():

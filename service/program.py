@@ -33,7 +33,7 @@ from service.commands import (
     simulate,
     status,
 )
-from service.terminal import begin_output, error_document, print_error, print_failure
+from service.terminal import begin_output, error_document, print_error, print_failure, print_json
 
 FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
 
@@ -99,8 +99,9 @@ def _options(
 
 
 def _run(words: list[str], as_json: bool) -> int:
-    if words == ["--version"]:
-        print(f"fringed {metadata.version('fringed')}")
+    if words in (["--version"], ["--version", "--json"]):
+        version = metadata.version("fringed")
+        print_json({"version": version}) if as_json else print(f"fringed {version}")
         return 0
     try:
         status = int(app(words, prog_name="fringed", standalone_mode=False) or 0)

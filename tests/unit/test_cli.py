@@ -84,6 +84,7 @@ def test_every_command_has_help_with_examples(command: str, run: Run) -> None:
 
 def test_version_and_bare_call(run: Run) -> None:
     assert run("--version")[:2] == (0, "fringed 0.1.0\n")
+    assert json.loads(run("--json", "--version")[1]) == {"version": "0.1.0"}
     status, out, _ = run()
     assert status == 0
     assert "check-config" in out
@@ -384,6 +385,12 @@ def test_mcp_carriers_alone_keep_the_default_order_of_code_words(run: Run, tmp_p
     given = ",".join(map(str, range(15, -1, -1)))
     assert made("given", *four, "--codes", given)[0] == list(range(15, -1, -1))
     assert made("alone", "--codes", given)[0] == list(range(15, -1, -1))
+
+
+def test_json_may_stand_before_the_command(run: Run) -> None:
+    status, out, err = run("--json", "patterns", "gray", "--size", "8x8", "-o", "images")
+    assert status == 0, err
+    assert json.loads(out)["folder"] == "images"
 
 
 def test_an_output_folder_that_is_not_empty_is_refused(run: Run, tmp_path: Path) -> None:
