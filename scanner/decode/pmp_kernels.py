@@ -34,7 +34,6 @@ from scanner.lanes import (
     power_of_two,
     root,
     store,
-    stream,
     whole,
 )
 
@@ -113,9 +112,8 @@ def decode_pixels(
         limits: [modulation, modulation over its noise squared, residual variance over noise variance, residual
             variance over B^2, remainder over its sigma squared, wrong-order probability, edge in sigmas].
         periodic: both ends of the field look alike. finest: index of the finest set.
-        position, sigma, confidence, albedo, modulation: (P,) float32 that begin with a cache line, as pixel `begin`
-            does, written; sigma, albedo and modulation may be empty, and are left out then. reason: (P,) uint8,
-            written.
+        position, sigma, confidence, albedo, modulation: (P,) float32, written; sigma, albedo and modulation may be
+            empty, and are left out then. reason: (P,) uint8, written.
         counts: (REASONS,) int64, how many pixels have each reason, is added to.
     """
     sets, steps = gains.size, ratios.size
@@ -224,13 +222,13 @@ def _decode_lanes(
         why = choose(top < clip, why, 2)
         known = good | ((why > 3) & (why < 5))
         value, wrong = choose(known, value, _NAN), choose(good, wrong, _F1)
-    stream(position, to, value)
-    stream(confidence, to, _F1 - wrong)
+    store(position, to, value)
+    store(confidence, to, _F1 - wrong)
     store(reason, to, why)
     if sigma.size > 0:
-        stream(sigma, to, choose(known, root(spread / square), _NAN))
-        stream(albedo, to, mean)
-        stream(modulation, to, root(square))
+        store(sigma, to, choose(known, root(spread / square), _NAN))
+        store(albedo, to, mean)
+        store(modulation, to, root(square))
 
 
 # --- the ladder as rows -----------------------------------------------------------------------------------------------
