@@ -19,6 +19,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
+from tests.rig import virtio_card
+
 CLONE = Path(__file__).parents[2]
 STATE = CLONE / ".setup/rig"
 HOME = Path("/usr/local/lib/fringed")
@@ -46,7 +48,14 @@ exposure_us = 4000
 loop_video = 1
 osd_text_mode = 2
 [projector]
-driver = "v4l2"
+{projector}
+[daemon]
+workers = {workers}
+[daemon.retention]
+min_free_gb = 0.1
+"""
+
+LOOPED = """driver = "v4l2"
 device = "platform-vivid.0-video-index1"
 mode = "640x480@59.94"
 # vivid's two ends have clocks of their own: what the output takes at its tick, the input has at its next.
@@ -54,11 +63,15 @@ latency_us = [0, 17000]
 settle_us = 0
 [projector.options]
 pixel_format = "GREY"
-[daemon]
-workers = {workers}
-[daemon.retention]
-min_free_gb = 0.1
 """
+
+ON_A_CARD = f"""driver = "kms"
+device = "{virtio_card.DEVICE}"
+mode = "640x480"
+latency_us = [0, 17000]
+settle_us = 0
+"""
+"""Nobody's camera sees that display: scans begin, and come to no good end"""
 
 KERNELS = """[Service]
 Environment=NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1
@@ -115,8 +128,8 @@ def install() -> None:
     must("systemctl", "daemon-reload")
 
 
-def write_rig(*, workers: int) -> None:
-    Path("/etc/fringed/rig.toml").write_text(RIG.format(workers=workers))
+def write_rig(*, workers: int, projector: str = LOOPED) -> None:
+    Path("/etc/fringed/rig.toml").write_text(RIG.format(workers=workers, projector=projector))
 
 
 def main_pid() -> int:

@@ -12,12 +12,13 @@ import stat
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.rig import vivid
+from tests.rig import virtio_card, vivid
 from tests.rig.installed import (
     CACHE,
     CLONE,
@@ -26,6 +27,7 @@ from tests.rig.installed import (
     LEFT_TO_COMPILE,
     LIB,
     MEMBER,
+    ON_A_CARD,
     RUN,
     STRANGER,
     Visitor,
@@ -48,6 +50,7 @@ UNITS = ("fringed.service", "fringed-worker@1.service")
 PATTERN = {"frequencies": [1, 8], "shifts": [4, 4]}
 SHORT = {"method": "pmp", "pattern": PATTERN}
 LONG = {**SHORT, "repeat": 20}
+LIVE = {"exposure": 4000.0, "content": "rows"}
 
 CAMERA = "/dev/v4l/by-path/platform-vivid.0-video-index0"
 """The node's number may be another one after it was pulled out"""
@@ -168,10 +171,34 @@ def test_a_stranger_is_kept_out_and_told_why() -> None:
     ],
 )
 def test_sockets_open_for_whom_they_should(user: str, path: Path, opens: bool) -> None:
+    _check_opens(user, path, opens)
+
+
+def _check_opens(user: str, path: Path, opens: bool) -> None:
     connect = f"import socket; socket.socket(socket.AF_UNIX).connect({str(path)!r})"
     tried = run("/usr/bin/python3", "-I", "-S", "-c", connect, user=user)
     assert (tried.returncode == 0) == opens, tried.stderr
     assert opens or "PermissionError" in tried.stderr
+
+
+@pytest.mark.parametrize(("kind", "params"), [("preview", {}), ("live", LIVE)])
+def test_what_can_be_watched_is_for_clients_alone(ada: Visitor, kind: str, params: dict[str, Any]) -> None:
+    """These sockets are there while somebody watches; a worker's process binds that of live runs."""
+    _check_watched(ada, kind, params)
+
+
+def _check_watched(visitor: Visitor, kind: str, params: dict[str, Any]) -> None:
+    visitor.ask("until", True)
+    visitor.hear("until")
+    visitor.ask(kind, params)
+    visitor.hear(kind, seconds=240)
+    path = RUN / f"{kind}.ipc"
+    assert (path.owner(), path.group(), stat.S_IMODE(path.stat().st_mode)) == ("fringed", "fringed-clients", 0o660)
+    _check_opens(MEMBER, path, True)
+    _check_opens(STRANGER, path, False)
+    visitor.ask("leave", {})
+    visitor.hear("left")
+    wait_for(lambda: not path.exists(), 10)
 
 
 @pytest.mark.parametrize("user", [MEMBER, STRANGER])
@@ -230,6 +257,31 @@ def plugged() -> Iterator[None]:
 @pytest.mark.usefixtures("plugged")
 @pytest.mark.parametrize("state", ["idle", "mid-scan"])
 def test_a_device_pulled_out_is_told_and_used_again_when_it_is_back(ada: Visitor, state: str) -> None:
+    _pull_out(ada, state, vivid, "vivid")
+    outcome = ada.scan(**SHORT)
+    assert outcome["state"] == "done", outcome
+
+
+def test_a_card_taken_away_is_told_and_used_again_when_it_is_back(ada: Visitor) -> None:
+    """The projector's whole card, unbound from its driver while it flips: see `virtio_card`."""
+    virtio_card.plug_in()
+    must("udevadm", "settle", "--timeout=30")
+    write_rig(workers=1, projector=ON_A_CARD)
+    try:
+        must("systemctl", "restart", "fringed")
+        for state in ("idle", "mid-scan"):
+            with Visitor(MEMBER) as visitor:
+                visitor.hear("hello")
+                _pull_out(visitor, state, virtio_card, virtio_card.DEVICE)
+    finally:
+        virtio_card.plug_in()
+        write_rig(workers=1)
+        must("systemctl", "restart", "fringed")
+    wait_for(lambda: len(children(main_pid())) == 2, 30)
+
+
+def _pull_out(ada: Visitor, state: str, device: ModuleType, name: str) -> None:
+    """device: has `unplug` and `bind`. name: of it, in messages."""
     attempts: list[dict[str, float]] = []
     while not attempts or _late(attempts):
         ada.ask("until", True)
@@ -237,7 +289,7 @@ def test_a_device_pulled_out_is_told_and_used_again_when_it_is_back(ada: Visitor
         if state == "mid-scan":
             ada.ask("scan", LONG)
             wait_for_frames(ada, 5)
-        vivid.unplug()
+        device.unplug()
         gone = time.monotonic()
         if state == "mid-scan":
             told = ada.hear("failed", "done")
@@ -249,21 +301,19 @@ def test_a_device_pulled_out_is_told_and_used_again_when_it_is_back(ada: Visitor
             told = ada.hear("until")
         refused = ada.scan(**SHORT)
         assert refused["reason"] == "device_lost", refused
-        assert "vivid" in refused["error"]["message"], refused
+        assert name in refused["error"]["message"], refused
         assert _held_nodes(children(main_pid())["service.devices_process"]) == []
-        vivid.bind()
+        device.bind()
         ada.ask("until", True)
         back = time.monotonic()
         attempts.append({"loss": told["t"] - gone, "back": ada.hear("until")["t"] - back})
-    outcome = ada.scan(**SHORT)
-    assert outcome["state"] == "done", outcome
 
 
 def _held_nodes(pid: int) -> list[str]:
-    """Video nodes that a process has open or mapped, those included that are gone."""
+    """Nodes of video devices and cards that a process has open or mapped, those included that are gone."""
     opened = [str(link.readlink()) for link in Path(f"/proc/{pid}/fd").iterdir()]
     mapped = _text(f"/proc/{pid}/maps").splitlines()
-    return [line for line in (*opened, *mapped) if "/dev/video" in line]
+    return [line for line in (*opened, *mapped) if "/dev/video" in line or "/dev/dri" in line]
 
 
 def wait_for_frames(visitor: Visitor, count: int) -> None:
@@ -306,6 +356,7 @@ def test_a_worker_of_its_own_unit_decodes_without_devices_and_network() -> None:
         outcome = ada.scan(**SHORT, folder="/home/ada/second")
         ada.ask("status", {})
         workers = ada.hear("status")["workers"]
+        _check_watched(ada, "live", LIVE)
     assert outcome.get("state") == "done", outcome
     assert np.abs(_rows("/home/ada/second") - np.arange(vivid.HEIGHT)[:, np.newaxis]).max() < 0.1
     assert [entry["pid"] for entry in workers] == [worker]

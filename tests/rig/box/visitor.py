@@ -1,7 +1,8 @@
 """A client's process in the guest, run as some user: obeys lines of JSON, and tells everything with the time it came.
 
 ["scan", {...}] starts a scan and tells its events; with "folder" its files are fetched. ["until", true] polls until the
-daemon has devices, false until it has none. ["status", {}] asks once.
+daemon has devices, false until it has none. ["status", {}] asks once. ["preview", {...}] and ["live", {...}] start one,
+tell of the first picture, and go on until ["leave", {}].
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Generator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -37,9 +40,19 @@ def until(client: Client, there: bool) -> None:
     tell("until")
 
 
+def watch(client: Client, kind: str, params: dict[str, Any]) -> Generator[None, None, None]:
+    """A preview, or a live run: goes on from its first picture until it is closed."""
+    with closing(client.previews(**params)) if kind == "preview" else client.live(**params) as pictures:
+        next(pictures)
+        tell(kind)
+        yield
+    tell("left")
+
+
 def main() -> int:
     try:
         with Client(sys.argv[1], name="visitor") as client:
+            watching = None
             tell("hello", **client.hello())
             for line in sys.stdin:
                 word, what = json.loads(line)
@@ -48,6 +61,10 @@ def main() -> int:
                         scan(client, what)
                     case "until":
                         until(client, what)
+                    case "preview" | "live":
+                        next(watching := watch(client, word, what))
+                    case "leave":
+                        next(watching, None)
                     case "status":
                         tell("status", **client.status())
     except ScannerError as error:
