@@ -60,7 +60,8 @@ class Amplitudes:
 
     def at(self, index: Ints) -> Amplitudes:
         """Those of some peaks."""
-        return Amplitudes(self.ratio[index], self.sigma[index], self.light[index])
+        wide = index.astype(np.intp)  # NumPy takes rows by numbers of that kind in a tenth of the time
+        return Amplitudes(*(np.take(part, wide, axis=0) for part in (self.ratio, self.sigma, self.light)))
 
 
 def measure(light: Array, tracks: Tracks, field: Array, model: PatternModel, scale: float, size: int) -> Amplitudes:
