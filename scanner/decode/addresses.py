@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scanner.kernel import kernel
 
 CACHE_LINE = 64
+PAGE = 4096
 
 _carray = cast(Any, numba).carray
 _compiler = cast(Any, cgutils)
@@ -67,6 +68,19 @@ def aligned_rows(rows: int, length: int) -> NDArray[np.float32]:
     Vector registers are as wide as a line: what lies across two of them takes twice as long to load or store.
     """
     block = np.empty(rows * length + CACHE_LINE // 4, np.float32)
+    skip = (-block.ctypes.data % CACHE_LINE) // 4
+    return block[skip : skip + rows * length].reshape(rows, length)
+
+
+def maps_to_fill(rows: int, length: int) -> NDArray[np.float32]:
+    """(rows, length) float32 of any content, in rows as `aligned_rows` has them, of memory that is there already.
+
+    Made while frames are being exposed: the system finds the memory then, and not after the last one. One block is
+    large enough for large pages, and of each page only a word is written: what is written whole has to leave the
+    caches again while frames are read.
+    """
+    block = np.empty(rows * length + CACHE_LINE // 4, np.float32)
+    block[:: PAGE // 4] = 0
     skip = (-block.ctypes.data % CACHE_LINE) // 4
     return block[skip : skip + rows * length].reshape(rows, length)
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Map, Reason
-from scanner.decode.addresses import addresses_of, aligned_rows
+from scanner.decode.addresses import addresses_of, maps_to_fill
 from scanner.decode.frames import FrameCheck
 from scanner.decode.graycode_bits import BOTH, INVERSE, PLAIN
 from scanner.decode.graycode_kernels import decode_codes, gather
@@ -114,10 +114,8 @@ class GrayDecoder:
         self._kept = {*sequence.fringes, *({sequence.white, sequence.black} - {None})}
         self._frames: dict[int, NDArray[Any]] = {}
         pixels = camera.width * camera.height
-        # Written now, while frames are being exposed: the system finds the memory before the last one has come.
         self._pixels, whole_vectors = pixels, -(-pixels // LANES) * LANES
-        self._maps = aligned_rows(2 * len(pattern.axes) + 3, whole_vectors)
-        self._maps.fill(0)
+        self._maps = maps_to_fill(2 * len(pattern.axes) + 3, whole_vectors)
         self._reason = np.full(whole_vectors, 0, np.uint8)
 
     def add(self, position: int, frame: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
@@ -225,7 +223,7 @@ class GrayDecoder:
         least = _middle(np.float32(ROUNDING_VARIANCE) / expected)
         within = ratios <= 9 * max(_middle(ratios) / 0.455, least)
         total = float(np.sum(ratios, where=within, dtype=np.float64))
-        return max(total / np.count_nonzero(within) / 0.973, least)
+        return float(max(total / np.count_nonzero(within) / 0.973, least))
 
     def _sample(self, codes: _Codes, size: int) -> tuple[Map, Map, Map, Map]:
         """Coarse images of the first axis and their inverses, (bits, n) float32, white and black, (n,)."""

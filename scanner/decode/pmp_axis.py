@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Map, Reason
-from scanner.decode.addresses import aligned_rows
+from scanner.decode.addresses import maps_to_fill
 from scanner.decode.agreement import MIN_PIXELS, Remainder
 from scanner.decode.neighbours import settle
 from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel
@@ -74,11 +74,7 @@ class AxisMaps:
     @classmethod
     def empty(cls, pixels: int) -> AxisMaps:
         """Maps to be written."""
-        # Written now: the system finds the memory now, while frames are being exposed, and
-        # not after the last one.
-        # One block of all maps: large enough for the system's large pages; and aligned, as vector stores like it.
-        block = aligned_rows(5, -(-pixels // 16) * 16)
-        block.fill(0)
+        block = maps_to_fill(5, -(-pixels // 16) * 16)
         position, sigma, confidence, albedo, modulation = (row[:pixels] for row in block)
         return cls(position, sigma, confidence, albedo, modulation, np.full(pixels, 0, np.uint8))
 
