@@ -230,12 +230,16 @@ def raise_unless_done(outcome: Mapping[str, Any]) -> None:
     Raises:
         ScannerError: of the class the daemon named, with its hint.
     """
-    if outcome["state"] == "done":
-        return
+    if outcome["state"] != "done":
+        raise error_of(outcome)
+
+
+def error_of(outcome: Mapping[str, Any]) -> ScannerError:
+    """The error of a job that did not end well, of the class that the daemon named, with its hint."""
     body = outcome.get("error")
     if body:
-        raise error_from_body(msgspec.convert(body, ErrorBody))
-    raise ScannerError(f"scan {outcome.get('id')} is {outcome['state']}: {outcome.get('reason')}")
+        return error_from_body(msgspec.convert(body, ErrorBody))
+    return ScannerError(f"scan {outcome.get('id')} is {outcome['state']}: {outcome.get('reason')}")
 
 
 def fetch(
@@ -247,7 +251,7 @@ def fetch(
         job_id: the job.
         folder: where the files go; it is made.
         on_progress: told of each piece.
-        failed_too: also of a job that failed: what a live run had recorded by then.
+        failed_too: also of a job that failed: the frames that it had recorded by then.
 
     Raises:
         ScannerError: the job did not end well.

@@ -24,10 +24,11 @@ from service.deliveries import WorkerLost
 from service.devices_link import DevicesLink
 from service.endings import error_of, reason_to_fail
 from service.jobs import Job, JobState
-from service.live_files import close_recording, recorded_files, reserve
+from service.live_files import close_recording, reserve
 from service.live_series import LiveSeries, LiveTotals
 from service.pipe import Ended, Frames, Kept, LiveBegan, Need, Shot
 from service.pipeline import Pipeline
+from service.series import recorded_files
 from service.worker_pool import WorkerPool
 
 STATS_S = 1.0

@@ -5,7 +5,6 @@ No pixel is looked at; digests of whole files are taken once, when the run is ov
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -18,7 +17,8 @@ from scanner.storage import replace_json, storage_errors
 from scanner.wire import FileEntry
 from service.jobs import Job
 from service.pipe import Kept
-from service.spool import CAPTURE, Spool
+from service.series import recorded_files
+from service.spool import Spool
 
 
 def reserve(spool: Spool, kept: Kept, jobs: Sequence[Job]) -> list[Job]:
@@ -29,17 +29,6 @@ def reserve(spool: Spool, kept: Kept, jobs: Sequence[Job]) -> list[Job]:
     """
     folders = max(1, kept.frames // 256)
     return spool.make_room(kept.bytes // folders, jobs)
-
-
-def recorded_files(folder: Path) -> list[FileEntry]:
-    """The files of a recording, by the names that clients fetch them by.
-
-    Raises:
-        StorageError: one cannot be read.
-    """
-    with storage_errors(folder):
-        paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name[0] != ".")
-        return [_entry(path, f"{CAPTURE}/{path.relative_to(folder).as_posix()}") for path in paths]
 
 
 def close_recording(folder: Path, reason: str) -> list[FileEntry]:
@@ -91,9 +80,3 @@ def _whole_lines(folder: Path) -> int:
         return (folder / "frames.jsonl").read_bytes().count(b"\n")
     except OSError:
         return 0
-
-
-def _entry(path: Path, name: str) -> FileEntry:
-    with path.open("rb") as file:
-        sha = hashlib.file_digest(file, "sha256").hexdigest()
-    return FileEntry(name, path.stat().st_size, sha)

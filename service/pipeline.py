@@ -24,7 +24,7 @@ from service.endings import error_of, reason_to_fail
 from service.jobs import Job, JobState, JobStore
 from service.pipe import Ended, Need
 from service.scan_hearing import ScanHearing
-from service.series import Series, capture_state, missing_patterns
+from service.series import Series, capture_state, frames_kept, missing_patterns
 from service.spool import Spool, empty_trash
 from service.worker_pool import WorkerPool
 
@@ -184,6 +184,9 @@ class Pipeline:
     async def _acquired(self, job: Job, ending: Awaitable[Ended]) -> None:
         ended = await ending
         series = self._series.get(job.id)
+        if job.state is JobState.FAILED:  # its decoding, meanwhile
+            await self._keep_frames(job)
+            await self._note(job)
         if job.state.over:
             return
         if ended.reason == "completed" and series is not None:
@@ -191,8 +194,7 @@ class Pipeline:
             await self._note(job)
             if job.state is JobState.CANCELLED:  # meanwhile
                 return
-            fields = {"reason": ended.reason, "missing": ended.missing, **ended.report}
-            self.tell(job, "acquired", fields)
+            self.tell(job, "acquired", {"reason": ended.reason, "missing": ended.missing, **ended.report})
             series.finish("completed", tuple(ended.missing))
             return
         if series is not None:
@@ -201,6 +203,7 @@ class Pipeline:
             await self.end(job, JobState.CANCELLED, reason="cancelled")
             return
         error = error_of(ended)
+        await self._keep_frames(job)
         await self.end(job, JobState.FAILED, reason=ended.reason or reason_to_fail(error), error=error)
 
     async def room_for(self, job: Job, need: Need) -> None:
@@ -258,10 +261,9 @@ class Pipeline:
             if not series.cancelled:
                 raise
         except WorkerLost as lost:
-            await self.end(job, JobState.FAILED, reason="worker_lost", error=lost.error)
+            await self._fail(job, "worker_lost", lost.error)
         except ScannerError as error:
-            reason = "daemon_restarted" if interrupted else reason_to_fail(error)
-            await self.end(job, JobState.FAILED, reason=reason, error=error)
+            await self._fail(job, "daemon_restarted" if interrupted else reason_to_fail(error), error)
         finally:
             self._series.pop(job.id, None)
 
@@ -306,10 +308,9 @@ class Pipeline:
         """Take up a job that an earlier daemon left unfinished. What was whole is decoded, nothing is done again."""
         capture = self.spool.capture(job.id)
         state, reason, count = capture_state(capture)
-        was = job.state
         if state == "none" or (state == "failed" and reason != "daemon_restarted"):
             error = ScannerError(
-                f"the daemon was restarted while this scan was {was}" + (f" (capture: {reason})" if reason else ""),
+                f"the daemon was restarted while this scan was {job.state}" + (f" (capture: {reason})" if reason else ""),
                 hint="ask for the scan again with a new job id",
             )
             await self.end(job, JobState.FAILED, reason="daemon_restarted", error=error)
@@ -326,6 +327,18 @@ class Pipeline:
         series.finish("completed" if state == "complete" else "daemon_restarted", missing)
         self.tell(job, "acquired", {"reason": job.reason or "completed", "missing": list(missing)})
         self._follow(job, series)
+
+    async def _fail(self, job: Job, reason: str, error: ScannerError) -> None:
+        """End a job whose decoding failed; see `_keep_frames`."""
+        if job.state is not JobState.ACQUIRING:  # else when its capture is closed
+            await self._keep_frames(job)
+        await self.end(job, JobState.FAILED, reason=reason, error=error)
+
+    async def _keep_frames(self, job: Job) -> None:
+        """List what a job that fails has recorded, now that it is closed: to be fetched and looked at."""
+        kept = await asyncio.to_thread(frames_kept, self.spool.capture(job.id))
+        if job.state is not JobState.CANCELLED:
+            job.files = kept
 
     # --- small things -------------------------------------------------------------------------------------------
 

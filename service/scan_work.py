@@ -7,7 +7,6 @@ folder; nothing of it is told before the series has ended, and frames that are t
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import threading
 import time
@@ -21,9 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.errors import DecodeError, ScannerError
+from scanner.scan_report import read_report
 from scanner.storage import Digests, prepare_output, remove_empty
 from scanner.stream import Ack, DecodedNote, End, Frame, FromWorker, PointsNote, Progress, Result, Start
 from scanner.wire import ArrayEntry, FileEntry
+from service.series import file_entry
 from service.spool import CAPTURE
 
 if TYPE_CHECKING:
@@ -211,7 +212,8 @@ class ScanWork:
         capture = sorted(path.name for path in self._folder.iterdir() if path.is_file() and path.name[0] != ".")
         entries += [file_entry(self._folder, name, f"{CAPTURE}/{name}") for name in capture]
         _log.info("delivery %d: files written in %.2f s", self.delivery, time.perf_counter() - began)
-        return Result(self.delivery, entries, dict(scan.report))
+        # As it was written: what JSON cannot say was refused there, and not by the socket.
+        return Result(self.delivery, entries, read_report(self._output / "report.json"))
 
     def _stage(self, name: str) -> None:
         self._check(self.delivery)
@@ -302,15 +304,6 @@ class _MappedFrames:
     def close(self) -> None:
         """Let the file go."""
         self._map = None
-
-
-def file_entry(folder: Path, name: str, listed_as: str | None = None, sha: str | None = None) -> FileEntry:
-    """A file's name, size and SHA-256 (read from it where it is not known), for the list that clients fetch by."""
-    path = folder / name
-    if sha is None:
-        with path.open("rb") as file:
-            sha = hashlib.file_digest(file, "sha256").hexdigest()
-    return FileEntry(listed_as or name, path.stat().st_size, sha)
 
 
 def _short(report: Any) -> dict[str, Any]:

@@ -7,7 +7,9 @@ second delivery or one after a restart is the same as the first. No pixel passes
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
+import logging
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -17,10 +19,13 @@ from typing import Any
 from scanner.errors import StorageError
 from scanner.storage import storage_errors
 from scanner.stream import DecodedNote, EndReason, Frame, LiveCounts, PointsNote, Progress, Result
+from scanner.wire import FileEntry
+from service.spool import CAPTURE
 
 HEADER = "capture.json"
 RECORDS = "frames.jsonl"
 FRAMES = "frames.npy"
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -150,9 +155,46 @@ def capture_state(capture: Path) -> tuple[str, str | None, int]:
 
 def missing_patterns(capture: Path, count: int) -> tuple[int, ...]:
     """Pattern indices without a whole line."""
+    last = {record["pattern"]: record for record in _records(capture)}
+    return tuple(pattern for pattern in range(count) if last.get(pattern, {}).get("slot") is None)
+
+
+def frames_kept(capture: Path) -> tuple[FileEntry, ...]:
+    """The files of a capture with at least one frame; none where they cannot be read: the scan has failed anyway."""
+    if not any(record["slot"] is not None for record in _records(capture)):
+        return ()
+    try:
+        return tuple(recorded_files(capture))
+    except StorageError as problem:
+        _log.warning("%s cannot be listed: %s", capture, problem)
+        return ()
+
+
+def recorded_files(folder: Path) -> list[FileEntry]:
+    """The files of a recording or capture, by the names that clients fetch them by.
+
+    Raises:
+        StorageError: one cannot be read.
+    """
+    with storage_errors(folder):
+        paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name[0] != ".")
+        names = [path.relative_to(folder).as_posix() for path in paths]
+        return [file_entry(folder, name, f"{CAPTURE}/{name}") for name in names]
+
+
+def file_entry(folder: Path, name: str, listed_as: str | None = None, sha: str | None = None) -> FileEntry:
+    """A file's name, size and SHA-256 (read from it where it is not known), for the list that clients fetch by."""
+    path = folder / name
+    if sha is None:
+        with path.open("rb") as file:
+            sha = hashlib.file_digest(file, "sha256").hexdigest()
+    return FileEntry(listed_as or name, path.stat().st_size, sha)
+
+
+def _records(capture: Path) -> list[dict[str, Any]]:
+    """The whole lines of frames.jsonl."""
     try:
         lines = (capture / RECORDS).read_bytes().split(b"\n")[:-1]
     except OSError:
-        lines = []
-    last = {record["pattern"]: record for line in lines if (record := _parsed(line)) is not None}
-    return tuple(pattern for pattern in range(count) if last.get(pattern, {}).get("slot") is None)
+        return []
+    return [record for line in lines if (record := _parsed(line)) is not None]

@@ -34,6 +34,9 @@ LONG_LIVED = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
 LONG_LIVED_THREADS = "strips_"
 """Those that share the pass over an image (`scanner.decode.strips`); they wait for the next one until Python exits"""
 
+LONG_LIVED_KINDS = ("GarbageCollectorThread",)
+"""pyzmq's, which frees what was sent without a copy; it ends with the process"""
+
 KERNEL_THREAD = 0x0020_0000
 """PF_KTHREAD among the flags of /proc/PID/stat (proc(5)): it has neither command line nor environment"""
 
@@ -117,7 +120,7 @@ def _traces(places: tuple[Path, Path]) -> Traces:
         threads=frozenset(
             f"{thread.name} ({thread.ident})"
             for thread in threading.enumerate()
-            if not thread.name.startswith(LONG_LIVED_THREADS)
+            if not thread.name.startswith(LONG_LIVED_THREADS) and type(thread).__name__ not in LONG_LIVED_KINDS
         ),
         sockets=frozenset(_sockets()),
         files=frozenset(str(path) for place in places for path in place.iterdir()),

@@ -47,6 +47,7 @@ from service.terminal import ProgressLines, progress_lines
 
 if TYPE_CHECKING:
     from scanner.client import Client
+    from scanner.errors import ScannerError
     from scanner.wire import Event
 
 INCOMING = ".incoming"
@@ -164,6 +165,12 @@ class Place:
         """The one that was asked for, or one that is free now."""
         return self.wanted or _fresh_folder()
 
+    @property
+    def failed(self) -> Path:
+        """Beside it, for the frames of a scan that failed: the same command can be typed again."""
+        names = chain([f"{self.folder.name}-failed"], (f"{self.folder.name}-failed-{n}" for n in count(2)))
+        return next(folder for folder in map(self.folder.with_name, names) if not folder.exists())
+
     def check(self) -> None:
         """Raise StorageError where no folder can be made, before anything moves."""
         from scanner.storage import try_output  # noqa: PLC0415
@@ -236,7 +243,10 @@ def _scan(endpoint: str, method: Method, params: Mapping[str, Any], place: Place
     with Client(endpoint, name="fringed scan") as client:
         job_id = client.start_scan(method.value, **params)
         try:
-            raise_unless_done(client.wait(job_id, _follower(place.folder, lines)))
+            outcome = client.wait(job_id, _follower(place.folder, lines))
+            if outcome["state"] == "failed" and outcome["files"]:
+                raise _with_frames_kept(client, outcome, place, lines)
+            raise_unless_done(outcome)
             lines.stage("fetching files")
             with place.made() as folder:
                 client.fetch(job_id, folder / INCOMING, lambda _, done, total: lines.advance(done, total))
@@ -245,6 +255,26 @@ def _scan(endpoint: str, method: Method, params: Mapping[str, Any], place: Place
             _cancel(client, job_id)
             raise
     return folder
+
+
+def _with_frames_kept(client: Client, outcome: Mapping[str, Any], place: Place, lines: ProgressLines) -> ScannerError:
+    """Bring what a failed scan recorded into a folder of its own; returns the scan's error, which then says where."""
+    from scanner.errors import StorageError  # noqa: PLC0415
+    from scanner.session import error_of  # noqa: PLC0415
+
+    error, job_id, folder = error_of(outcome), str(outcome["id"]), place.failed
+    incoming = folder.with_name(f".{folder.name}{INCOMING}")
+    try:
+        lines.stage("fetching the frames of the failed scan")
+        client.fetch(job_id, incoming, lambda _, done, total: lines.advance(done, total), failed_too=True)
+        incoming.replace(folder)
+        kept = f"its frames are kept: fringed audit {folder}"
+    except (StorageError, OSError) as problem:
+        kept = f"its frames could not be kept: {problem}"
+    finally:
+        shutil.rmtree(incoming, ignore_errors=True)
+    error.hint = f"{error.hint}; {kept}" if error.hint else kept
+    return error
 
 
 def _follower(folder: Path, lines: ProgressLines) -> Callable[[Event], None]:

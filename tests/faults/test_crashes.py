@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from scanner.capture import Capture
 from scanner.client import AsyncClient, Client
 from scanner.errors import DecodeError, DeviceLost, Unreachable
 from service.config import load_rig
@@ -46,7 +47,7 @@ def test_a_worker_killed_in_mid_scan_is_replaced(daemon: Callable[..., RunningDa
 
 
 def test_a_capture_that_kills_its_worker_three_times_is_given_up_and_named(
-    daemon: Callable[..., RunningDaemon],
+    daemon: Callable[..., RunningDaemon], tmp_path: Path
 ) -> None:
     running = daemon()
     killed: set[int] = set()
@@ -65,6 +66,9 @@ def test_a_capture_that_kills_its_worker_three_times_is_given_up_and_named(
         assert "fringed decode" in status["error"]["data"]["hint"]
         with pytest.raises(DecodeError, match=job):
             client.fetch(job, Path("never"))
+        wait_for(lambda: client.result(job)["files"])  # the capture may still have been under way
+        kept = Capture.open(client.fetch(job, tmp_path / "kept", failed_too=True) / "capture")
+        assert (kept.header.state, kept.missing) == ("complete", ())
         assert client.scan("mcp").xyz is not None
 
 
