@@ -270,7 +270,8 @@ class Reconstruction:
                 self.add(pattern, capture.frame(pattern), slot, stays=True)
 
     def _new_decoder(self, observer: Observer | None = None) -> Decoder:
-        return decoder_for(self._header.sequence, self._header.camera, self._options.decoder, observer)
+        fit = None if self._calibration is None else self._calibration.extra.get("mcp_phase")
+        return decoder_for(self._header.sequence, self._header.camera, self._options.decoder, observer, fit)
 
     def capture_report(self, capture: Capture) -> dict[str, Any]:
         """The report's `capture`: made anew where the folder was closed since."""

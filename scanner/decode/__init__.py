@@ -137,7 +137,11 @@ def require_decoder(method: str, name: str) -> None:
 
 
 def decoder_for(
-    sequence: PatternSequence, camera: CameraFormat, name: str = "default", observer: Observer | None = None
+    sequence: PatternSequence,
+    camera: CameraFormat,
+    name: str = "default",
+    observer: Observer | None = None,
+    mcp_phase: Mapping[str, Any] | None = None,
 ) -> Decoder:
     """The decoder for a pattern.
 
@@ -146,6 +150,7 @@ def decoder_for(
         camera: the frames' format.
         name: "default", or a decoder of that method by name: "casey2011" for MCP, the dissertation's own.
         observer: told the intermediate images, if one is given.
+        mcp_phase: a calibration's code-to-phase fit, if it has one. "casey2011" alone uses it: others know the rows.
 
     Raises:
         DecodeError: no such decoder for this method, or one that has no stages for the observer.
@@ -160,7 +165,7 @@ def decoder_for(
     if name == "casey2011":
         from scanner.decode.mcp.casey2011 import CaseyDecoder  # noqa: PLC0415
 
-        return CaseyDecoder(sequence, camera, observer)
+        return CaseyDecoder(sequence, camera, observer, mcp_phase)
     if isinstance(sequence.pattern, PmpPattern):
         from scanner.decode.pmp import PmpDecoder  # noqa: PLC0415
 

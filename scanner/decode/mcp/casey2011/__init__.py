@@ -7,6 +7,7 @@
     channels           band-pass without demodulation, two-sigma threshold       4.4, 4.5
     hidden_markov      states with errors and misses, Viterbi                    5.2, 5.3
     growth             mode, blobs, growth, stripes between                      5.4, 2.1
+    code_to_phase      projector rows of stripes, by the calibration's fit       3.7
 
 It is a yardstick, by name ("casey2011"): one decision after another, each hard, rows at stripe peaks only. Where the
 dissertation leaves a value to the user, or its text is lost, the function that needs it says what was taken and why.
@@ -14,18 +15,11 @@ dissertation leaves a value to the user, or its text is lost, the function that 
 
 from __future__ import annotations
 
-from scanner.decode.mcp.casey2011.decoder import CaseyDecoder, decode_image
-from scanner.patterns import CameraFormat, McpPattern, ProjectorSize
+from scanner.decode.mcp.casey2011.decoder import CaseyDecoder, decode_image, load_kernels
 
 __all__ = ["CaseyDecoder", "decode_image", "warm_up"]
 
 
 def warm_up() -> None:
     """Call every kernel once with the types that frames have, so that no scan waits for a compiler."""
-    projector = ProjectorSize(256, 192)
-    pattern = McpPattern(bits=2, carriers=(20.0, 34.0), codes=(0, 1, 2, 3), levels="composite")
-    light = pattern.fringe(0, projector)
-    for bits in (8, 12):
-        camera = CameraFormat(projector.width, projector.height, bits)
-        frame = (10 + light * (0.8 * camera.max_value)).astype(camera.dtype)
-        decode_image(frame, pattern, projector, camera)
+    load_kernels()

@@ -57,7 +57,8 @@ class Search:
 
 
 def spectrum(image: Array) -> Spectrum:
-    """(H, W // 2 + 1) complex64: transform of the image less its mean."""
+    """The Fourier transform of the image less its mean (sec. 4.3; sec. 4.4 takes the bands from it): (H, W // 2 + 1)
+    complex64. The mean is taken out as for the stripes' spectrum (sec. 4.1)."""
     return np.asarray(fft.rfft2(image - image.mean()))
 
 
@@ -135,7 +136,11 @@ def search(
 
 
 def common_factor(A: NDArray[np.float64], lines: NDArray[np.float64]) -> float:
-    """The factor, 1 -+ TOLERANCE, at which A is largest on all `lines` (N,) together, by the mean of logarithms."""
+    """The factor, 1 -+ TOLERANCE, at which A is largest on all `lines` (N,) together, by the mean of logarithms.
+
+    Ours: sec. 4.3 says that optics change the projected frequencies, and to search without them. Printed texture puts
+    bands of its own beside the carriers, which no other knowledge tells from them.
+    """
     factors = np.arange(1 - TOLERANCE, 1 + TOLERANCE, 0.5 / lines[-1])
     at = np.clip(np.rint(factors[:, None] * lines).astype(np.intp), 0, len(A) - 1)
     return float(factors[np.argmax(np.log(np.maximum(A[at], 1e-12 * A.max() + 1e-30)).sum(axis=1))])

@@ -5,14 +5,15 @@ The door is the default decoder's: what a frame must be, and vertical stripes (a
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode import Decoded, Reason
+from scanner.decode import Decoded
 from scanner.decode.mcp.casey2011 import (
     carrier_search,
     channels,
@@ -22,6 +23,8 @@ from scanner.decode.mcp.casey2011 import (
     refusals,
     stripe_detection,
 )
+from scanner.decode.mcp.casey2011.code_to_phase import CodeToPhase, code_to_phase
+from scanner.decode.mcp.casey2011.maps import maps_of
 from scanner.decode.mcp.casey2011.shown import Shown
 from scanner.decode.mcp.decoder import McpDecoder
 from scanner.decode.mcp.door import turned_back, upright_image
@@ -39,15 +42,41 @@ class CaseyDecoder(McpDecoder):
     """Takes the one frame of an MCP sequence and decodes it as published.
 
     `observer` is told the intermediate images, stripes horizontal, like figures 5.4-5.15 (`shown.STAGES`).
+    `fit`: see `decode_image`.
     """
 
-    def __init__(self, sequence: PatternSequence, camera: CameraFormat, observer: Observer | None = None) -> None:
+    def __init__(
+        self,
+        sequence: PatternSequence,
+        camera: CameraFormat,
+        observer: Observer | None = None,
+        fit: Mapping[str, Any] | None = None,
+    ) -> None:
         super().__init__(sequence, camera)
         self._observer = observer
+        self._fit = fit
+        load_kernels()
 
     def finish(self) -> Decoded:
         """The maps; see `scanner.decode.Decoder`."""
-        return decode_image(self.frame(), self._pattern, self._sequence.projector, self._camera, self._observer)
+        frame, projector = self.frame(), self._sequence.projector
+        return decode_image(frame, self._pattern, projector, self._camera, self._observer, self._fit)
+
+
+@cache
+def load_kernels() -> None:
+    """Call every kernel once with the types that frames have.
+
+    Loading them from the cache takes as long as decoding a frame, and compiling them much longer: neither is left to
+    the first frame.
+    """
+    projector = ProjectorSize(256, 192)
+    pattern = McpPattern(bits=2, carriers=(20.0, 34.0), codes=(0, 1, 2, 3), levels="composite")
+    light = pattern.fringe(0, projector)
+    for bits in (8, 12):
+        camera = CameraFormat(projector.width, projector.height, bits)
+        frame = (10 + light * (0.8 * camera.max_value)).astype(camera.dtype)
+        decode_image(frame, pattern, projector, camera)
 
 
 def decode_image(
@@ -56,8 +85,9 @@ def decode_image(
     projector: ProjectorSize,
     camera: CameraFormat,
     observer: Observer | None = None,
+    fit: Mapping[str, Any] | None = None,
 ) -> Decoded:
-    """Decode one image as published.
+    """Decode one image as published (chapters 4 and 5; fig. 4.1).
 
     Args:
         image: (H, W) uint8 or uint16, linear camera response, as captured.
@@ -65,6 +95,8 @@ def decode_image(
         projector: size of the projector's image.
         camera: format of `image`.
         observer: told the intermediate images in order, up to the stage that fails if one does; see `shown.STAGES`.
+        fit: slope and intercept of the calibration's code-to-phase fit (sec. 3.7), see `code_to_phase`; None: it has
+            none, and the pattern's own line is used.
 
     Returns:
         maps on the camera's grid, with rows on the pixels of stripe peaks, minima and mid-levels only.
@@ -76,25 +108,34 @@ def decode_image(
     pattern.validate(projector)
     upright = upright_image(image, pattern, camera)
     model = PatternModel.of(pattern, projector)
+    what = _What(pattern, model, camera, code_to_phase(model, fit))
     try:
-        decoded = _decode(upright, pattern, model, camera, Shown(observer))
+        decoded = _decode(upright, what, Shown(observer))
     except DecodeError:
-        found = _upside_down(upright, pattern, model, camera, observer)
+        found = _upside_down(upright, what, observer)
         if found is None:
-            _refuse_turned(upright, pattern, model, camera)
+            _refuse_turned(upright, what)
             raise
         decoded = found
     return decoded if pattern.axis == "y" else turned_back(decoded)
 
 
-def _decode(
-    image: NDArray[Any], pattern: McpPattern, model: PatternModel, camera: CameraFormat, show: Shown
-) -> Decoded:
+@dataclass(frozen=True, eq=False)
+class _What:
+    """What was projected and how it was captured; phase: projector rows of stripes."""
+
+    pattern: McpPattern
+    model: PatternModel
+    camera: CameraFormat
+    phase: CodeToPhase
+
+
+def _decode(upright: NDArray[Any], what: _What, show: Shown) -> Decoded:
     """The stages in order, stripes horizontal and the first on top."""
-    upright = image
+    model, phase = what.model, what.phase
     clock = Stages()
     show("input", upright)
-    refusals.refuse_flat(upright, camera)
+    refusals.refuse_flat(upright, what.camera)
     with clock.stage("stripes"):
         found = stripe_detection.detect(upright, model.stripes, model.weakest)
     show("enhanced", found.enhanced)
@@ -102,16 +143,16 @@ def _decode(
     show.on_peaks("stripes", np.ones(len(found.peaks.y), np.uint8), found)
     refusals.refuse_few(found, upright)
     read = _read_channels(upright, found, model, clock, show)
-    named = _name_peaks(read.word, found, pattern, model, clock, show)
+    named = _name_peaks(read.word, found, what.pattern, model, clock, show)
     with clock.stage("stripes between"):
         light = found.calm[found.peaks.y, found.peaks.column]
         stripe, sure = growth.name_unmodulated(named.stripe, named.sure, found.peaks, light)
         calm = stripe_detection.calmed(upright.astype(np.float32), found.wavelength, across=1)
         marks = growth.name_2x_4x(calm, stripe, sure, found.peaks)
     with clock.stage("maps"):
-        decoded = _maps(upright, found, stripe, marks, model, camera)
+        decoded = maps_of(upright, found, stripe, marks, phase, what.camera)
     show.on_peaks("all-stripes", stripe + 1, found)
-    show.marks(marks, model.pitch, found.region.shape)
+    show.marks(marks, phase, found.region.shape)
     details = {
         **named.figures,
         "pitch_px": round(found.wavelength, 3),
@@ -122,22 +163,20 @@ def _decode(
         "peaks": len(found.peaks.y),
         "peaks_decided": int((stripe >= 0).sum()),
         "marks": len(marks.x),
+        "code_to_phase": {"slope": phase.slope, "intercept": phase.intercept, "from": phase.source},
         "timings_ms": {name: round(ms, 2) for name, ms in clock.ms.items()},
     }
-    return replace(decoded, details=details, warnings=_warnings(details))
+    said = (*_warnings(details), phase.warning) if phase.warning else _warnings(details)
+    return replace(decoded, details=details, warnings=said)
 
 
 # --- another way up -----------------------------------------------------------------------------------------------
 
 
-def _upside_down(
-    image: NDArray[Any], pattern: McpPattern, model: PatternModel, camera: CameraFormat, observer: Observer | None
-) -> Decoded | None:
+def _upside_down(image: NDArray[Any], what: _What, observer: Observer | None) -> Decoded | None:
     """The maps if the projector or the camera hangs upside down, so that the stripes' order is reversed; else None."""
     try:
-        decoded = _decode(
-            np.ascontiguousarray(image[::-1]), pattern, model, camera, Shown(observer, "image upside down")
-        )
+        decoded = _decode(np.ascontiguousarray(image[::-1]), what, Shown(observer, "image upside down"))
     except DecodeError:
         return None
     names = ("rows", "sigma_rows", "confidence", "albedo", "modulation", "reason", "stripes")
@@ -148,12 +187,12 @@ def _upside_down(
     return replace(decoded, **flipped, peaks=peaks, details={**decoded.details, "upside_down": True})
 
 
-def _refuse_turned(image: NDArray[Any], pattern: McpPattern, model: PatternModel, camera: CameraFormat) -> None:
+def _refuse_turned(image: NDArray[Any], what: _What) -> None:
     """Raise DecodeError if the pattern is there, codes and all, once the image is turned."""
     turned = np.ascontiguousarray(image.T)
     for way_up in (turned, np.ascontiguousarray(turned[::-1])):
         try:
-            _decode(way_up, pattern, model, camera, Shown(None))
+            _decode(way_up, what, Shown(None))
         except DecodeError:
             continue
         raise DecodeError(
@@ -163,11 +202,6 @@ def _refuse_turned(image: NDArray[Any], pattern: McpPattern, model: PatternModel
 
 
 # --- what is on the peaks -------------------------------------------------------------------------------------------
-
-
-_SIGMA_PX = np.array([12**-0.5, 0.5, 1.0, 0.5], np.float32)
-"""Error of peaks, mid-levels, minima and mid-levels, camera px: a peak's is that of rounding to whole pixels; a minimum
-lies off by about the width of the blur, a mid-level by half of that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,7 +290,7 @@ def _name_peaks(
     clock: Stages,
     show: Shown,
 ) -> _Named:
-    """Hidden Markov model and what follows it, on modulated stripes (sec. 4.5, 5.2-5.4)."""
+    """Hidden Markov model and what follows it, on modulated stripes (sec. 4.5, 5.2-5.5)."""
     peaks, wavelength, shape = found.peaks, found.wavelength, found.region.shape
     stripes = np.array([s for s in range(model.stripes) if pattern.code_of(s)], np.int32)
     symbols = np.array([pattern.code_of(int(s)) for s in stripes], np.int32)
@@ -320,51 +354,3 @@ def _warnings(details: dict[str, Any]) -> tuple[str, ...]:
             "for each carrier, and strong keystone or texture need the default decoder"
         )
     return tuple(said)
-
-
-# --- maps -----------------------------------------------------------------------------------------------------------
-
-
-def _maps(
-    image: NDArray[Any],
-    found: stripe_detection.Stripes,
-    stripe: NDArray[np.int32],
-    marks: growth.Marks,
-    model: PatternModel,
-    camera: CameraFormat,
-) -> Decoded:
-    """Maps with values on the marks; albedo and modulation over one stripe around every pixel."""
-    shape = found.region.shape
-    high = 2 * round(found.wavelength / 2) + 1
-    at = marks.y, marks.x
-    rows = np.full(shape, np.nan, np.float32)
-    # The code-to-phase fit of sec. 3.7 as the pattern itself gives it (slope h, intercept h / 2 - 0.5).
-    row = ((marks.index + 0.5) * model.pitch - 0.5).astype(np.float32)
-    rows[at] = row
-    sigma = np.full(shape, np.nan, np.float32)
-    sigma[at] = np.float32(model.pitch / found.wavelength) * _SIGMA_PX[np.rint(4 * (marks.index % 1)).astype(np.intp)]
-    confidence = np.zeros(shape, np.float32)
-    confidence[at] = marks.confidence
-    upper = cv2.dilate(image, np.ones((high, 1), np.uint8)).astype(np.float32)
-    lower = cv2.erode(image, np.ones((high, 1), np.uint8)).astype(np.float32)
-    albedo = cv2.boxFilter(image, cv2.CV_32F, (1, high))
-    named = np.full(shape, -1, np.int16)
-    peaks = found.peaks
-    named[peaks.y, peaks.column] = stripe
-    reason = np.where(upper > found.threshold, np.uint8(Reason.BORDER), np.uint8(Reason.SHADOW))
-    reason[peaks.y, peaks.column] = Reason.UNWRAP_RISK
-    reason[image >= camera.max_value] = Reason.CLIPPED
-    reason[at] = Reason.VALUE
-    listed = np.stack([marks.x, marks.y, row, marks.index, marks.confidence], axis=1).astype(np.float32)
-    return Decoded(
-        rows=rows,
-        columns=None,
-        sigma_rows=sigma,
-        sigma_columns=None,
-        confidence=confidence,
-        albedo=np.asarray(albedo, np.float32),
-        modulation=np.asarray(upper - lower, np.float32),
-        reason=reason,
-        stripes=named,
-        peaks=listed,
-    )

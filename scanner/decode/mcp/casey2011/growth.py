@@ -144,6 +144,8 @@ def _mode(label: Labels, start: Labels, y: Labels, reach: int, half: float, name
         for other in range(max(0, c - reach), min(columns, c + reach + 1)):
             first = start[other]
             for p in range(start[c], start[c + 1]):
+                if label[p] == 0:
+                    continue
                 # Both columns run downwards: what lies above this peak's window lies above the next one's.
                 while first < start[other + 1] and y[first] - y[p] < -half:
                     first += 1

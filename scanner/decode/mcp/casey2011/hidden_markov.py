@@ -120,7 +120,10 @@ def best_paths(word: NDArray[np.int32], start: NDArray[np.int32], known: Model) 
 
 
 def fitting(word: NDArray[np.int32], path: NDArray[np.int32], symbols: NDArray[np.int32]) -> float:
-    """Share of the observed code words that are the symbols of the path; 0 if there are none."""
+    """Share of the observed code words that are the symbols of the path; 0 if there are none.
+
+    Ours: the dissertation knows that the pattern is there, in the order described; a scanner has to notice where not.
+    """
     seen = word > 0
     expected = np.concatenate(([0], symbols))[path[seen]]
     return float((word[seen] == expected).mean()) if seen.any() else 0.0
@@ -131,7 +134,8 @@ def posteriors(
 ) -> NDArray[np.float32]:
     """Probability of the path's symbol at each peak by forward and backward sums, (P,) float32; 0 without one.
 
-    Not in the dissertation: it is the confidence handed on, and as modest as the model's error rates are crude.
+    Ours, from the model of sec. 5.2: the dissertation has no confidence, and each point of a scan needs one. It
+    is as modest as the model's error rates are crude.
     """
     return _posteriors(word, start, path, np.exp(known.start), np.exp(known.step), np.exp(known.emission))
 
@@ -156,17 +160,42 @@ def _longest(start: Labels) -> int:
 
 
 @kernel
-def _likeliest(best: Table, step: Table, s: int, n: int) -> int:
-    """The predecessor of s. Left to right: symbols follow earlier symbols and error states, e_i follows s_i and e_i."""
+def _one_on(before: Table, step: Table, score: Table) -> None:
+    """Into `score` that of the likeliest way to each state one observation later, without what is seen there.
+
+    Left to right: symbols follow earlier symbols and error states, e_i follows s_i and e_i.
+    """
+    n = (len(before) - 1) // 2
+    for s in range(n, 2 * n + 1):
+        score[s] = before[s] + step[s, s]
+        if s > n:
+            score[s] = max(score[s], before[s - n - 1] + step[s - n - 1, s])
+    for s in range(n):
+        score[s] = before[n] + step[n, s]
+    for r in range(n):
+        # s_i and e_i have the same successors, with the same probabilities.
+        _raise(max(before[r], before[n + r + 1]), step[r, r + 1 : n], score[r + 1 : n])
+
+
+@kernel
+def _raise(known: float, step: Table, score: Table) -> None:
+    for s in range(len(score)):
+        way = known + step[s]
+        score[s] = way if way > score[s] else score[s]
+
+
+@kernel
+def _came_from(before: Table, step: Table, s: int, n: int) -> int:
+    """The likeliest predecessor of s; of those alike the first in the order e_0, symbols, other error states."""
     if s >= n:
-        before = s - n - 1
-        return before if before >= 0 and best[before] + step[before, s] > best[s] + step[s, s] else s
+        symbol = s - n - 1
+        return symbol if symbol >= 0 and before[symbol] + step[symbol, s] > before[s] + step[s, s] else s
     came = n
     for r in range(s):
-        if best[r] + step[r, s] > best[came] + step[came, s]:
+        if before[r] + step[r, s] > before[came] + step[came, s]:
             came = r
     for r in range(n + 1, n + s + 1):
-        if best[r] + step[r, s] > best[came] + step[came, s]:
+        if before[r] + step[r, s] > before[came] + step[came, s]:
             came = r
     return came
 
@@ -175,56 +204,55 @@ def _likeliest(best: Table, step: Table, s: int, n: int) -> int:
 def _viterbi(word: Labels, start: Labels, first: Table, step: Table, emission: Table) -> Labels:
     states, most = len(first), _longest(start)
     n = (states - 1) // 2
+    observed = np.ascontiguousarray(emission.T)
     path = np.zeros(len(word), np.int32)
     at = np.empty(most, np.int64)
-    back = np.empty((most, states), np.int16)
-    best = np.empty(states)
-    new = np.empty(states)
+    score = np.empty((most, states))
     for c in range(len(start) - 1):
         count = _observed(word, start[c], start[c + 1], at)
+        if count == 0:
+            continue
         for t in range(count):
-            seen = word[at[t]]
-            for s in range(states):
-                if t == 0:
-                    new[s] = first[s] + emission[s, seen]
-                else:
-                    came = _likeliest(best, step, s, n)
-                    new[s] = best[came] + step[came, s] + emission[s, seen]
-                    back[t, s] = came
-            best, new = new, best
-        state = np.argmax(best)
+            if t == 0:
+                score[0] = first
+            else:
+                _one_on(score[t - 1], step, score[t])
+            score[t] += observed[word[at[t]]]
+        state = int(np.argmax(score[count - 1]))
         for t in range(count - 1, -1, -1):
             if state < n:
                 path[at[t]] = state + 1
-            state = back[t, state] if t > 0 else state
+            if t > 0:
+                state = _came_from(score[t - 1], step, state, n)
     return path
 
 
 @kernel
-def _reached(before: Table, step: Table, s: int, n: int) -> float:
-    """Sum over the predecessors of s."""
-    total: float = 0.0
-    if s >= n:
-        total += before[s] * step[s, s]
+def _reached(before: Table, new: Table, step: Table) -> None:
+    """Into `new` the sum over the predecessors of each state."""
+    n = (len(before) - 1) // 2
+    for s in range(n, 2 * n + 1):
+        new[s] = before[s] * step[s, s]
         if s > n:
-            total += before[s - n - 1] * step[s - n - 1, s]
-        return total
-    total += before[n + s] * step[n + s, s]
-    for r in range(s):
-        total += before[r] * step[r, s] + before[n + r] * step[n + r, s]
-    return total
+            new[s] += before[s - n - 1] * step[s - n - 1, s]
+    for s in range(n):
+        new[s] = before[n + s] * step[n + s, s]
+    for r in range(n):
+        of_symbol, of_error, later = step[r, r + 1 : n], step[n + r, r + 1 : n], new[r + 1 : n]
+        for s in range(len(later)):
+            later[s] += before[r] * of_symbol[s] + before[n + r] * of_error[s]
 
 
 @kernel
-def _one_back(backward: Table, new: Table, step: Table, emission: Table, seen: int) -> None:
-    """The backward sums one observation earlier, scaled; `new` is work space."""
+def _one_back(backward: Table, new: Table, step: Table, observed: Table) -> None:
+    """The backward sums one observation earlier, scaled; `new` is work space. observed: (S,) its emission."""
     states = len(new)
     n = (states - 1) // 2
     for r in range(n, states):
         # e_i and s_i have the same successors: e_i and every later symbol.
-        total = step[r, r] * emission[r, seen] * backward[r]
+        total = step[r, r] * observed[r] * backward[r]
         for s in range(r - n, n):
-            total += step[r, s] * emission[s, seen] * backward[s]
+            total += step[r, s] * observed[s] * backward[s]
         new[r] = total
         if r > n:
             new[r - n - 1] = total
@@ -234,7 +262,7 @@ def _one_back(backward: Table, new: Table, step: Table, emission: Table, seen: i
 @kernel
 def _posteriors(word: Labels, start: Labels, path: Labels, first: Table, step: Table, emission: Table) -> Confidence:
     states, most = len(first), _longest(start)
-    n = (states - 1) // 2
+    observed = np.ascontiguousarray(emission.T)
     sure = np.zeros(len(word), np.float32)
     at = np.empty(most, np.int64)
     forward = np.empty((most, states))
@@ -243,9 +271,11 @@ def _posteriors(word: Labels, start: Labels, path: Labels, first: Table, step: T
     for c in range(len(start) - 1):
         count = _observed(word, start[c], start[c + 1], at)
         for t in range(count):
-            for s in range(states):
-                chance = first[s] if t == 0 else _reached(forward[t - 1], step, s, n)
-                forward[t, s] = chance * emission[s, word[at[t]]]
+            if t == 0:
+                forward[t] = first
+            else:
+                _reached(forward[t - 1], forward[t], step)
+            forward[t] *= observed[word[at[t]]]
             forward[t] /= forward[t].sum()
         backward[:] = 1.0
         for t in range(count - 1, -1, -1):
@@ -253,5 +283,5 @@ def _posteriors(word: Labels, start: Labels, path: Labels, first: Table, step: T
             if state >= 0:
                 total = (forward[t] * backward).sum()
                 sure[at[t]] = forward[t, state] * backward[state] / total
-            _one_back(backward, new, step, emission, word[at[t]])
+            _one_back(backward, new, step, observed[word[at[t]]])
     return sure

@@ -78,7 +78,7 @@ def segments(peaks: Peaks, slope: Array, limit: float, wavelength: float, shape:
 
 
 def segment_of(found: list[Segment], slope: Array, limit: float) -> NDArray[np.intp]:
-    """Index of the segment that each peak is decoded in, (P,)."""
+    """Index of the segment that each peak is decoded in (sec. 4.2, eq. 5.11), (P,)."""
     number = np.zeros(len(slope), np.intp)
     for k, segment in enumerate(found):
         if segment.name == "positive":
@@ -89,7 +89,8 @@ def segment_of(found: list[Segment], slope: Array, limit: float) -> NDArray[np.i
 
 
 def turned_level(image: Array, segment: Segment) -> Array:
-    """The segment with its stripes level, (H, W) float32; zero outside."""
+    """The segment, masked and turned until its stripes are level (sec. 4.2, eq. 5.12, 5.13), (H, W) float32; zero
+    outside."""
     if segment.slope == 0:
         return image
     masked = image * segment.mask
@@ -97,12 +98,15 @@ def turned_level(image: Array, segment: Segment) -> Array:
 
 
 def level_mask(segment: Segment) -> Binary:
-    """The segment's mask with its stripes level, (H, W) uint8."""
+    """The segment's mask, turned with it (sec. 4.2), (H, W) uint8: sec. 4.5 takes mean and sigma of what is inside."""
     return segment.mask if segment.slope == 0 else np.asarray(_warp(segment.mask, segment.turn, cv2.INTER_NEAREST))
 
 
 def turned_back(bits: Binary, segment: Segment) -> Binary:
-    """A binary image of the level segment as the camera saw it, (H, W) uint8."""
+    """A binary image of the level segment turned back to how the camera saw it (sec. 4.2), (H, W) uint8.
+
+    Channels are turned back, not code words, so that all segments are read on the same peaks.
+    """
     if segment.slope == 0:
         return bits
     return np.asarray(_warp(bits, np.asarray(cv2.invertAffineTransform(segment.turn), np.float64), cv2.INTER_NEAREST))

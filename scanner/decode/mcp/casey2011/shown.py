@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.decode.mcp.casey2011.code_to_phase import CodeToPhase
 from scanner.decode.mcp.casey2011.growth import Marks
 from scanner.decode.mcp.casey2011.stripe_detection import Stripes
 from scanner.decode.stages import Look, Observer, Stage
@@ -73,7 +74,7 @@ class Shown:
         image[found.peaks.y, found.peaks.column] = value
         self(name, image)
 
-    def marks(self, marks: Marks, pitch: float, shape: tuple[int, ...]) -> None:
+    def marks(self, marks: Marks, phase: CodeToPhase, shape: tuple[int, ...]) -> None:
         """Show the last two stages: all marks, and their projector rows along the middle column."""
         if self._observer is None:
             return
@@ -81,4 +82,4 @@ class Shown:
         image[marks.y, marks.x] = np.rint(4 * marks.index).astype(np.int32) + 1
         self("2x-4x", image)
         middle = marks.x == shape[1] // 2
-        self("column", np.stack([marks.y[middle], (marks.index[middle] + 0.5) * pitch - 0.5]))
+        self("column", np.stack([marks.y[middle], phase.rows(marks.index[middle])]))

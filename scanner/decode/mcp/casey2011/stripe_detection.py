@@ -90,7 +90,9 @@ def detect(image: NDArray[np.uint8] | NDArray[np.uint16], stripes: int, weakest:
 
 
 def calmed(grey: Array, wavelength: float, across: int = ACROSS) -> Array:
-    """The image in which peaks are sought: a short moving average, (H, W) float32.
+    """The image in which peaks are sought (sec. 4.1: the unfiltered one), after a short moving average, (H, W) float32.
+
+    The average is ours: without it the camera's noise decides among the pixels of a tip (see ACROSS).
 
     Minima and mid-levels are sought with `across` 1: rows on either side of a minimum between unequal stripes differ.
     """
