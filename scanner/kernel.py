@@ -28,11 +28,6 @@ def kernel(function: _F) -> _F:
     return cast(_F, numba.njit(cache=CACHED, nogil=True, error_model="numpy")(function))
 
 
-def parallel_kernel(function: _F) -> _F:
-    """Compile `function` for all threads (`numba.prange`), cached, without the interpreter lock."""
-    return cast(_F, numba.njit(cache=CACHED, nogil=True, parallel=True, error_model="numpy")(function))
-
-
 def contracting_kernel(function: _F) -> _F:
     """Compile `function` like `kernel`, free to multiply and add in one instruction, with one rounding for two.
 

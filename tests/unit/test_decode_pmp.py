@@ -11,7 +11,7 @@ import pytest
 
 from scanner.decode import Reason, decoder_for
 from scanner.decode.neighbours import CONFIDENCE, settle
-from scanner.decode.pmp import PmpDecoder, PmpThresholds, warm_up
+from scanner.decode.pmp import PmpDecoder, PmpThresholds
 from scanner.decode.pmp_sums import ARCTAN_ERROR_CYCLES, _phase
 from scanner.decode.strips import MIN_STRIP, in_strips
 from scanner.errors import DecodeError
@@ -421,10 +421,6 @@ def test_thresholds_can_be_chosen_and_are_reported():
     assert report["method"] == "pmp"
     assert report["unwrapping"]["y"]["frequencies"] == [1.0, 8.0, 40.0]
     assert report["noise"]["measured"] is True
-
-
-def test_kernels_compile_before_they_are_needed():
-    warm_up()
 
 
 @pytest.mark.parametrize(("shifts", "exponent", "warned"), [(3, 1.3, True), (3, 1.0, False), (8, 1.3, False)])

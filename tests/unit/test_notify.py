@@ -77,7 +77,10 @@ def test_where_nobody_listens_nothing_fails(environment: dict[str, str]) -> None
     told = Notifier(environment)
     told.ready("x")
     told.ending()
-    asyncio.run(asyncio.wait_for(told.feed(lambda: True), 5))
+    asked: list[bool] = []
+    asyncio.run(asyncio.wait_for(told.feed(lambda: not asked.append(True)), 5))
+    assert asked == []  # nobody is fed
+    assert not told.watched
 
 
 def test_every_key_of_the_units_is_known_and_set_once() -> None:

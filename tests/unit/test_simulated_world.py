@@ -70,7 +70,9 @@ def test_a_world_ends_with_its_devices() -> None:
     first.close()
     del first
     gc.collect()
-    projector_driver.open("quick/board", {"seed": 2}, clock).close()
+    other = projector_driver.open("quick/board", {"seed": 2}, clock)  # refused in a world of seed 1
+    assert "quick/board" in other.name
+    other.close()
 
 
 def test_settings_of_the_world_may_stand_in_either_table_but_not_differ() -> None:
