@@ -3,25 +3,31 @@
     python bench/mcp.py [--scene bust] [--pattern own|published] [--runs 20] [--seconds 20] [--threads 2]
 
 Prints the median CPU time of one thread, ms: of a frame decoded by itself to all maps, of one in a series (pitch and
-carriers are known from the frame before) with each stage, of one in a series to rows alone, and of its XYZ; then the
-frames a second that so many threads sustain, each with a decoder of its own, from image to XYZ.
+carriers are known from the frame before) with each stage, of one in a series to rows alone, and of its XYZ; stages that
+have a plain NumPy form in that form too, as a ratio (`mcp_plain`); the reference decoder (casey2011) with each stage,
+which must take 400 ms at most; then the frames a second that so many threads sustain, each with a decoder of its own,
+from image to XYZ. Fails where the reference decoder takes longer.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import threading
 import time
 
 import cv2
+import mcp_plain
 import numba
 import numpy as np
 from mcp_accuracy import PATTERNS, take
 
 from scanner.decode import decoder_for
-from scanner.decode.mcp import decode_image, warm_up
+from scanner.decode.mcp import casey2011, decode_image, warm_up
 from scanner.decode.mcp.decoder import decode_next, positions_next
 from scanner.triangulation import triangulate
+
+MOST_REFERENCE_MS = 400.0
 
 
 def main():
@@ -51,9 +57,26 @@ def main():
     print(f"{chosen.scene}, {chosen.pattern}, {camera.width} x {camera.height}: by itself {one:.1f} ms a frame,")
     print(f"  in a series {next_one:.1f} ms, rows alone {positions:.1f} ms, XYZ {xyz:.1f} ms:")
     print(f"  image to XYZ {positions + xyz:.1f} ms, with all maps {next_one + xyz:.1f} ms")
+    upright = frame if sequence.pattern.axis == "y" else np.ascontiguousarray(frame.T)
+    mcp_plain.compare(lambda: decode_next(*given, known), upright, calibration, found)
+    reference = reference_decoder(given, max(3, chosen.runs // 4))
     if chosen.seconds:
         rate = sustained(frame, sequence, camera, calibration, chosen.threads, chosen.seconds)
         print(f"  {chosen.threads} threads over {chosen.seconds:g} s: {rate:.1f} frames a second, image to XYZ")
+    return int(reference > MOST_REFERENCE_MS)
+
+
+def reference_decoder(given, runs):
+    """Print the reference decoder's stages; its median CPU time, ms."""
+    casey2011.warm_up()
+    times, stages = [], []
+    for _ in range(runs + 1):
+        stages.append(timed(times, lambda: casey2011.decode_image(*given)).details["timings_ms"])
+    whole = float(np.median(times[1:]))
+    print(f"  reference decoder (casey2011): {whole:.1f} ms a frame (at most {MOST_REFERENCE_MS:g})")
+    for name in stages[-1]:
+        print(f"    {name:20s}{np.median([s[name] for s in stages[1:]]):7.2f} ms")
+    return whole
 
 
 def timed(times, work):
@@ -86,4 +109,4 @@ def sustained(frame, sequence, camera, calibration, threads, seconds):
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

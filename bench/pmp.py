@@ -116,7 +116,9 @@ def measure_others(sequence, camera, stacks):
         ours.append(coordinates_time(pmp.PmpDecoder(sequence, camera), stacks[run % STACKS]))
     others = {"OpenCV and NumPy": lambda frames: plain_decode(sequence.pattern, frames)}
     if importlib.util.find_spec("fringes") is not None:
-        others['fringes, mode "fast"'] = decoder_of_fringes(sequence.pattern)
+        others['fringes, mode "fast"'] = decode = decoder_of_fringes(sequence.pattern)
+        # Its rows count from the projector's edge, ours from the first row's middle.
+        require_fringes_agrees(decode, stacks[0], coordinates_of(sequence, camera, stacks[0]) + sequence.pattern.origin)
     else:
         print("fringes is not installed: no comparison with it")
     for name, decode in others.items():
@@ -127,6 +129,14 @@ def measure_others(sequence, camera, stacks):
             decode(stacks[(run + 1) % STACKS])
             times.append(time.perf_counter() - begin)
         print(f"{name:30s}{1e3 * np.median(times):8.1f}   {np.median(times) / np.median(ours):5.1f} x ours")
+
+
+def coordinates_of(sequence, camera, frames):
+    """Rows of our decoder."""
+    decoder = pmp.PmpDecoder(sequence, camera)
+    for position, frame in enumerate(frames):
+        decoder.add(position, frame)
+    return decoder.finish().rows
 
 
 def plain_decode(pattern, frames):
@@ -145,14 +155,26 @@ def plain_decode(pattern, frames):
 
 
 def decoder_of_fringes(pattern):
-    """The decode of the package `fringes` for the same sets (GPL; never a dependency)."""
+    """The decode of the package `fringes`, 2.0.1 or later, for the same sets (GPL; never a dependency)."""
     from fringes import Fringes  # noqa: PLC0415  (GPL: only where a user has installed it)
 
-    fringes = Fringes(Y=PROJECTOR.height, X=PROJECTOR.width, D=1, axis=1)
+    fringes = Fringes(Y=PROJECTOR.height, X=PROJECTOR.width)
+    fringes.axes = (0,)
+    fringes.K = len(pattern.frequencies)
     fringes.N = list(pattern.shifts)
     fringes.v = list(pattern.frequencies)
+    fringes.p0 = 0.0  # its phase starts at the projector's edge, as ours does
     fringes.mode = "fast"
     return fringes.decode
+
+
+def require_fringes_agrees(decode, frames, ours):
+    """What is timed must be the same work: rows that differ by less than a tenth of one, but for wrong periods."""
+    theirs = np.asarray(decode(frames).x, np.float64).squeeze()
+    off = np.abs(theirs - ours)
+    share = float(np.mean(off[np.isfinite(ours)] < 0.1))
+    print(f"fringes: rows agree with ours to {np.nanmedian(off):.4f} (median), {share:.2%} to better than 0.1")
+    assert share > 0.99, "fringes decodes something else: check its axes, sets and phase offset against ours"
 
 
 def frames_of(sequence, camera, seed):
