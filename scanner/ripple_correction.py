@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Map
+from scanner.errors import DecodeError
 from scanner.kernel import kernel
 from scanner.patterns import Axis, PatternSequence, PmpPattern
 
@@ -29,10 +30,17 @@ def without_ripple(decoded: Decoded, sequence: PatternSequence) -> Decoded:
     """The same maps without the finest set's ripple, where it is told and certain; PMP only.
 
     In `details`, the set's `ripple_px` becomes what may be left, and `corrected` is true.
+
+    Raises:
+        DecodeError: another method.
     """
     pattern = sequence.pattern
     light: Mapping[str, Any] = decoded.details.get("light") or {}
-    if not isinstance(pattern, PmpPattern) or not light:
+    if not isinstance(pattern, PmpPattern):
+        raise DecodeError(
+            f"ripple is corrected in PMP scans, and this one is {pattern.method}", hint="leave --correct-ripple out"
+        )
+    if not light:
         return decoded
     maps: dict[Axis, Map | None] = {"y": decoded.rows, "x": decoded.columns}
     told = dict(light)

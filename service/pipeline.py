@@ -309,8 +309,9 @@ class Pipeline:
         capture = self.spool.capture(job.id)
         state, reason, count = capture_state(capture)
         if state == "none" or (state == "failed" and reason != "daemon_restarted"):
+            how = f" (capture: {reason})" if reason else ""
             error = ScannerError(
-                f"the daemon was restarted while this scan was {job.state}" + (f" (capture: {reason})" if reason else ""),
+                f"the daemon was restarted while this scan was {job.state}{how}",
                 hint="ask for the scan again with a new job id",
             )
             await self.end(job, JobState.FAILED, reason="daemon_restarted", error=error)

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode import Decoded, Map, Reason
+from scanner.decode import Decoded, Reason
 from scanner.decode.frames import FrameCheck
 from scanner.decode.graycode import GrayDecoder
 from scanner.decode.phase_and_code import PhaseAndCode, compare_phase_and_code
-from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis
+from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps
 from scanner.decode.pmp_frames import axis_frames
 from scanner.decode.reasons import REASONS
 from scanner.decode.strips import threads_to_use
@@ -147,31 +147,15 @@ class GrayPmpDecoder:
         counts: NDArray[np.int64],
         warnings: tuple[str, ...],
     ) -> Decoded:
-        shape = self._camera.shape
-        values: dict[Axis, tuple[Map, Map]] = {
-            axis: (f.maps.position.reshape(shape), f.maps.sigma.reshape(shape)) for axis, f in found.items()
+        details = {
+            "method": self._pattern.method,
+            "counts": {r.name.lower(): int(counts[r]) for r in Reason if counts[r]},
+            "noise": asdict(next(iter(found.values())).noise),
+            "light": {axis: f.light.as_dict() for axis, f in found.items()},
+            "phase_and_code": {axis: a.as_dict() for axis, a in agreement.items()},
+            "code": {key: code.details[key] for key in ("counts", "thresholds", "noise_factor")},
         }
-        rows, sigma_rows = values.get("y", (None, None))
-        columns, sigma_columns = values.get("x", (None, None))
-        return Decoded(
-            rows=rows,
-            columns=columns,
-            sigma_rows=sigma_rows,
-            sigma_columns=sigma_columns,
-            confidence=maps.confidence.reshape(shape),
-            albedo=maps.albedo.reshape(shape),
-            modulation=maps.modulation.reshape(shape),
-            reason=maps.reason.reshape(shape),
-            warnings=warnings,
-            details={
-                "method": self._pattern.method,
-                "counts": {r.name.lower(): int(counts[r]) for r in Reason if counts[r]},
-                "noise": asdict(next(iter(found.values())).noise),
-                "light": {axis: f.light.as_dict() for axis, f in found.items()},
-                "phase_and_code": {axis: a.as_dict() for axis, a in agreement.items()},
-                "code": {key: code.details[key] for key in ("counts", "thresholds", "noise_factor")},
-            },
-        )
+        return decoded_maps(found, maps, self._camera, warnings, details)
 
 
 @kernel

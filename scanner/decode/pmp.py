@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scanner.decode import Decoded, Map, Reason, neighbours
 from scanner.decode.agreement import disagreements
 from scanner.decode.frames import FrameCheck
-from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis
+from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps
 from scanner.decode.pmp_frames import axis_frames
 from scanner.decode.strips import threads_to_use
 from scanner.decode.unwrapping import plan_ladder
@@ -183,29 +183,11 @@ class PmpDecoder:
     # --- the result ---------------------------------------------------------------------------------------------
 
     def _decoded(self, warnings: tuple[str, ...]) -> Decoded:
-        axes, shape = self._pattern.axes, self._camera.shape
-        found = [self._found[axis] for axis in axes]
+        found = [self._found[axis] for axis in self._pattern.axes]
         merged, counts = found[0].maps, found[0].counts
         if len(found) == 2:
             counts = merged.join(found[1].maps)
-        by_axis = {
-            axis: (f.maps.position.reshape(shape), f.maps.sigma.reshape(shape))
-            for axis, f in zip(axes, found, strict=True)
-        }
-        rows, sigma_rows = by_axis.get("y", (None, None))
-        columns, sigma_columns = by_axis.get("x", (None, None))
-        return Decoded(
-            rows=rows,
-            columns=columns,
-            sigma_rows=sigma_rows,
-            sigma_columns=sigma_columns,
-            confidence=merged.confidence.reshape(shape),
-            albedo=merged.albedo.reshape(shape),
-            modulation=merged.modulation.reshape(shape),
-            reason=merged.reason.reshape(shape),
-            warnings=warnings,
-            details=self._details(counts),
-        )
+        return decoded_maps(self._found, merged, self._camera, warnings, self._details(counts))
 
     def _details(self, counts: NDArray[np.int64]) -> dict[str, Any]:
         # What varies least is noise alone: of two axes, the better one stands for the camera.

@@ -6,13 +6,15 @@ kernels leave the interpreter lock alone. Both axes of a scan are decoded apart 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode import Map, Reason
+from scanner.decode import Decoded, Map, Reason
 from scanner.decode.addresses import maps_to_fill
 from scanner.decode.agreement import MIN_PIXELS, Remainder
 from scanner.decode.neighbours import settle
@@ -26,6 +28,7 @@ from scanner.decode.reasons import REASONS
 from scanner.decode.strips import in_strips
 from scanner.decode.unwrapping import Ladder, plan_ladder
 from scanner.patterns import CameraFormat
+from scanner.patterns.description import Axis
 from scanner.patterns.pmp import PmpPattern
 
 
@@ -90,6 +93,34 @@ class AxisMaps:
             other.position, other.sigma, other.confidence, other.albedo, other.modulation, other.reason, counts,
         )  # fmt: skip
         return counts
+
+
+def decoded_maps(
+    found: Mapping[Axis, AxisFound],
+    merged: AxisMaps,
+    camera: CameraFormat,
+    warnings: tuple[str, ...],
+    details: Mapping[str, Any],
+) -> Decoded:
+    """The maps of one or both axes as a decoder's result, without a copy.
+
+    Args:
+        merged: confidence, albedo, modulation and reason of all axes (see `AxisMaps.join`).
+    """
+    shape = camera.shape
+    rows, columns = (found[axis].maps if axis in found else None for axis in ("y", "x"))
+    return Decoded(
+        rows=None if rows is None else rows.position.reshape(shape),
+        columns=None if columns is None else columns.position.reshape(shape),
+        sigma_rows=None if rows is None else rows.sigma.reshape(shape),
+        sigma_columns=None if columns is None else columns.sigma.reshape(shape),
+        confidence=merged.confidence.reshape(shape),
+        albedo=merged.albedo.reshape(shape),
+        modulation=merged.modulation.reshape(shape),
+        reason=merged.reason.reshape(shape),
+        warnings=warnings,
+        details=details,
+    )
 
 
 LEAST_RIPPLE_CYCLES = 0.003

@@ -19,6 +19,7 @@ from scanner.patterns import (
     ProjectorSize,
 )
 from scanner.patterns.graypmp import default_gray_pmp
+from scanner.ripple_correction import without_ripple
 from scanner.sequencer.thumbnail import thumbnail
 from scanner.sequencer.witness import witness
 from service.scan_patterns import pattern_for
@@ -212,3 +213,9 @@ def test_few_pixels_are_not_judged():
     found = decode(described(sequence, offset=0.5), {p: f.astype(np.uint8) for p, f in dark.items()})
     assert np.isfinite(found.rows).any()
     assert found.details["phase_and_code"]["y"]["cells"] < 8
+
+
+def test_ripple_is_not_corrected_where_one_set_measures():
+    sequence = PatternSequence(PROJECTOR, default_gray_pmp(("y",), PROJECTOR))
+    with pytest.raises(DecodeError, match="this one is gray\\+pmp"):
+        without_ripple(decode(sequence, take(sequence)), sequence)
