@@ -151,7 +151,8 @@ class LiveReconstruction:
         return rows
 
     def _new_decoder(self) -> Decoder:
-        return decoder_for(self._header.sequence, self._header.camera, self._options.decoder)
+        fit = None if self._calibration is None else self._calibration.extra.get("mcp_phase")
+        return decoder_for(self._header.sequence, self._header.camera, self._options.decoder, mcp_phase=fit)
 
 
 def row_scale(length: int) -> float:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scanner import reconstruct
+from scanner import reconstruct, reconstruct_live
 from scanner.capture.header import CaptureHeader
 from scanner.decode import decoder_for
 from scanner.geometry import Calibration, Lens
@@ -58,9 +58,12 @@ def test_a_fit_of_another_pattern_is_named_and_not_used():
 def test_a_scan_s_decoder_is_told_the_fit_of_its_calibration(fit, monkeypatch):
     asked = []
     monkeypatch.setattr(reconstruct, "decoder_for", lambda *a: asked.append(a[4]) or decoder_for(*a))
+    monkeypatch.setattr(reconstruct_live, "decoder_for", lambda *a, mcp_phase: asked.append(mcp_phase))
     matrix = np.array([[400.0, 0, 128], [0, 400.0, 96], [0, 0, 1]])
     lens = Lens((256, 192), matrix, np.zeros(5))
     rig = Calibration(lens, lens, np.eye(3), np.array([0.0, 100, 0]), extra={"mcp_phase": fit})
     header = CaptureHeader(PatternSequence(SIZE, PATTERN), CAMERA, frames=("0.png",))
-    reconstruct.Reconstruction(header, rig, reconstruct.DecodeOptions(decoder="casey2011"))
-    assert asked == [fit]
+    options = reconstruct.DecodeOptions(decoder="casey2011")
+    reconstruct.Reconstruction(header, rig, options)
+    reconstruct_live.LiveReconstruction(header, rig, options)
+    assert asked == [fit, fit]
