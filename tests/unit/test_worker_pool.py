@@ -32,7 +32,7 @@ class Router:
     async def recv_multipart(self) -> list[bytes]:
         return await self._incoming.get()
 
-    def send_multipart(self, parts: Sequence[bytes], _flags: int) -> asyncio.Future[None]:
+    def send_multipart(self, parts: Sequence[bytes], _flags: int, *, copy: bool) -> asyncio.Future[None]:
         self.sent.append(decoded(parts[1]))
         done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         done.set_result(None)
