@@ -50,8 +50,12 @@ def copies_of(
     addresses: NDArray[np.intp], at: int, size: int, like: NDArray[Any], spare: NDArray[Any]
 ) -> NDArray[np.intp]:
     """Addresses of copies of `size` pixels from `at` on, for less than a vector of them: nothing may be read beyond a
-    frame's last pixel. spare: (F, a vector's length) that
-    holds them. For kernels; address 0 stays what it is."""
+    frame's last pixel. For kernels; address 0 stays what it is.
+
+    Args:
+        spare: (F, a vector's length) that holds the copies. Numba frees an array once it was mentioned for the last
+            time, and knows nothing of addresses: give it to `keep` when the copies were read.
+    """
     copies = np.empty_like(addresses)
     for n in range(addresses.size):
         copies[n] = 0
@@ -59,6 +63,12 @@ def copies_of(
             spare[n, :size] = pixels_at(addresses[n], at, size, like)
             copies[n] = spare[n:].ctypes.data - at * like.itemsize
     return copies
+
+
+@kernel
+def keep(spare: NDArray[Any]) -> None:
+    """Mention memory that was read by its address: until here it was not free to be given away. For kernels."""
+    spare[0, 0] = 0
 
 
 @kernel

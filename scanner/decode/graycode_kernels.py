@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.addresses import CACHE_LINE, aligned_rows, copies_of, pixels_at
+from scanner.decode.addresses import CACHE_LINE, aligned_rows, copies_of, keep, pixels_at
 from scanner.decode.graycode_bits import BOTH, levels_of_pairs, read_bits, value_and_spread
 from scanner.decode.reasons import count_reasons
 from scanner.kernel import contracting_kernel, inlined_kernel
@@ -117,12 +117,15 @@ def decode_codes(
         )  # fmt: skip
     if solid < end:
         # What is left goes into vectors of its own: nothing may be read beyond a frame's last pixel.
-        near = copies_of(table, solid, end - solid, like, np.zeros((table.size, LANES), like.dtype))
-        of_levels = copies_of(levels, solid, end - solid, like, np.zeros((2, LANES), like.dtype))
+        spare, spare_levels = np.zeros((table.size, LANES), like.dtype), np.zeros((2, LANES), like.dtype)
+        near = copies_of(table, solid, end - solid, like, spare)
+        of_levels = copies_of(levels, solid, end - solid, like, spare_levels)
         _decode_lanes(
             near.reshape(addresses.shape), kinds, pairs, of_levels, like, coarse, clip, gray, shift, sizes, noise,
             limits, solid, stride, spot, flat, reason,
         )  # fmt: skip
+        keep(spare)
+        keep(spare_levels)
     for at in range(begin, end, STRETCH):
         count_reasons(reason[at : min(at + STRETCH, end)], counts)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.addresses import CACHE_LINE, aligned_rows, copies_of
+from scanner.decode.addresses import CACHE_LINE, aligned_rows, copies_of, keep
 from scanner.decode.pmp_sums import fit_lanes, turns_of
 from scanner.decode.reasons import count_reasons
 from scanner.kernel import contracting_kernel, inlined_kernel
@@ -142,6 +142,7 @@ def decode_pixels(
             scale, limits, periodic, finest, beats, terms, parts, unit, spot, solid, 0,
             last[0], last[1], last[2], last[3], last[4], last_reason,
         )  # fmt: skip
+        keep(spare)
         position[solid:end], confidence[solid:end] = last[0, :size], last[2, :size]
         reason[solid:end] = last_reason[:size]
         if sigma.size > 0:
