@@ -168,8 +168,10 @@ class Place:
     @property
     def failed(self) -> Path:
         """Beside it, for the frames of a scan that failed: the same command can be typed again."""
-        names = chain([f"{self.folder.name}-failed"], (f"{self.folder.name}-failed-{n}" for n in count(2)))
-        return next(folder for folder in map(self.folder.with_name, names) if not folder.exists())
+        beside = self.folder.resolve()
+        name = f"{beside.name or 'scan'}-failed"
+        names = chain([name], (f"{name}-{n}" for n in count(2)))
+        return next(folder for folder in (beside.parent / name for name in names) if not folder.exists())
 
     def check(self) -> None:
         """Raise StorageError where no folder can be made, before anything moves."""
@@ -259,22 +261,33 @@ def _scan(endpoint: str, method: Method, params: Mapping[str, Any], place: Place
 
 def _with_frames_kept(client: Client, outcome: Mapping[str, Any], place: Place, lines: ProgressLines) -> ScannerError:
     """Bring what a failed scan recorded into a folder of its own; returns the scan's error, which then says where."""
-    from scanner.errors import StorageError  # noqa: PLC0415
+    from scanner.errors import ScannerError, StorageError  # noqa: PLC0415
     from scanner.session import error_of  # noqa: PLC0415
+    from scanner.storage import storage_errors  # noqa: PLC0415
 
     error, job_id, folder = error_of(outcome), str(outcome["id"]), place.failed
     incoming = folder.with_name(f".{folder.name}{INCOMING}")
     try:
         lines.stage("fetching the frames of the failed scan")
-        client.fetch(job_id, incoming, lambda _, done, total: lines.advance(done, total), failed_too=True)
-        incoming.replace(folder)
-        kept = f"its frames are kept: fringed audit {folder}"
-    except (StorageError, OSError) as problem:
+        shutil.rmtree(incoming, ignore_errors=True)  # of a command that was killed
+        with storage_errors(folder):
+            incoming.mkdir(parents=True)
+            client.fetch(job_id, incoming, lambda _, done, total: lines.advance(done, total), failed_too=True)
+            if not any(incoming.iterdir()):
+                raise StorageError("the daemon has them no more")
+            incoming.replace(folder)
+        kept = f"its frames are kept: fringed audit {_as_typed(folder)}"
+    except ScannerError as problem:
         kept = f"its frames could not be kept: {problem}"
     finally:
         shutil.rmtree(incoming, ignore_errors=True)
     error.hint = f"{error.hint}; {kept}" if error.hint else kept
     return error
+
+
+def _as_typed(folder: Path) -> Path:
+    """From the working directory, where it lies in there."""
+    return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 
 
 def _follower(folder: Path, lines: ProgressLines) -> Callable[[Event], None]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from scanner.errors import DecodeError, StorageError
+from scanner.errors import DecodeError, StorageError, Unreachable
 from scanner.wire import error_body
 from service.commands.scan import Place, _with_frames_kept
 from service.series import frames_kept
@@ -38,6 +38,8 @@ class Fetching:
 
     def fetch(self, job: str, folder: Path, told: Callable[[str, int, int], None], *, failed_too: bool) -> Path:
         assert failed_too
+        if isinstance(self.error, KeyError):
+            return folder  # of a job whose files were deleted meanwhile
         (folder / "capture").mkdir(parents=True)
         if self.error is not None:
             raise self.error
@@ -73,11 +75,37 @@ def test_frames_come_beside_the_scans_place_which_stays_free(tmp_path: Path) -> 
     place.check()
 
 
-@pytest.mark.parametrize("problem", [StorageError("no room"), OSError("no room")])
-def test_frames_that_do_not_arrive_whole_leave_nothing(problem: Exception, tmp_path: Path) -> None:
-    said = kept(Fetching(problem), Place(tmp_path / "one", force=False))
-    assert said == "look closer; its frames could not be kept: no room"
+@pytest.mark.parametrize(
+    ("problem", "said"),
+    [
+        (StorageError("no room"), "no room"),
+        (OSError(28, "no room"), "no room"),
+        (Unreachable("nobody answers"), "nobody answers"),
+        (KeyError(), "the daemon has them no more"),
+    ],
+)
+def test_frames_that_do_not_arrive_whole_leave_nothing(problem: Exception, said: str, tmp_path: Path) -> None:
+    hint = kept(Fetching(problem), Place(tmp_path / "one", force=False))
+    assert hint.startswith("look closer; its frames could not be kept: ")
+    assert hint.endswith(said)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_place_without_a_name_has_one_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here" / "below").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here")
+    assert Place(Path(), force=True).failed == tmp_path / "here-failed"
+    monkeypatch.chdir(tmp_path / "here" / "below")
+    assert Place(Path(".."), force=True).failed == tmp_path / "here-failed"
+    assert Place(Path("/"), force=True).failed.name == "scan-failed"
+    assert "fringed audit one-failed" in kept(Fetching(), Place(Path("one"), force=False))
+
+
+def test_what_a_killed_command_left_is_not_mixed_in(tmp_path: Path) -> None:
+    (tmp_path / ".one-failed.incoming" / "capture").mkdir(parents=True)
+    (tmp_path / ".one-failed.incoming" / "capture" / "old.json").touch()
+    kept(Fetching(), Place(tmp_path / "one", force=False))
+    assert [path.name for path in (tmp_path / "one-failed" / "capture").iterdir()] == ["capture.json"]
 
 
 def test_an_interrupt_meanwhile_leaves_nothing(tmp_path: Path) -> None:
