@@ -76,7 +76,7 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     if (wrong := inside.get("wrong")) is not None:
         everywhere = (truth.get("lit") or {}).get("wrong")
         more = f"; {everywhere:,} with those at edges" if everywhere not in (None, wrong) else ""
-        facts.append(("wrong", f"{wrong:,} points on a wrong fringe or stripe{more}"))
+        facts.append(("wrong", f"{wrong:,} points off by half a fringe or stripe, or by 20 mm{more}"))
     return facts
 
 
@@ -94,13 +94,16 @@ def _frames(capture: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _uncertainty(budget: Mapping[str, Any]) -> tuple[str, str] | None:
     """One line of the budget: what a point's depth is good to, and what is not in that."""
-    if not budget or budget.get("expanded_mm") is None:
+    if not budget or budget.get("within_mm") is None:
         return None
     names = budget.get("unknown") or ()
     unknown = ", ".join(names)
-    whom = "what is known of it" if "method" in names else "of 95 in 100 points"
-    text = (
-        f"+-{budget['expanded_mm']:.3f} mm at {budget['depth_mm']:.0f} mm, {whom}: "
-        f"{budget['random_mm']:.3f} mm random and {budget['systematic_mm']:.3f} mm systematic (1 sigma)"
-    )
+    at = f"at {budget['depth_mm']:.0f} mm"
+    if "method" in names:  # what is known is the least of it: no figure of the whole
+        text = f"{budget['random_mm']:.3f} mm random (1 sigma of the median point) {at}"
+    else:
+        text = (
+            f"+-{budget['within_mm']:.3f} mm {at}, of 95 in 100 points: {budget['random_mm']:.3f} mm random "
+            f"(the median point) and {budget['systematic_mm']:.3f} mm systematic (1 sigma)"
+        )
     return "uncertainty", f"{text}{f'; unknown, and not in it: {unknown}' if unknown else ''}"

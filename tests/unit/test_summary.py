@@ -35,6 +35,7 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
         "depth_mm": {"p1": 1.0, "p99": 2.0},
         "uncertainty": {
             "expanded_mm": 0.144,
+            "within_mm": 0.163,
             "depth_mm": 700.2,
             "random_mm": 0.07,
             "systematic_mm": 0.0169,
@@ -48,7 +49,26 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "1 of the pattern, 1 white, 1 black, 6 black and white around them that prove the timing, 2 times" in printed
     assert "99.0% of the pixels in which the pattern shows, 20.0% keep a point" in printed
     assert "(7 px and more from edges)" in printed
-    assert "+-0.144 mm at 700 mm" in printed
-    assert "0.070 mm random and 0.017 mm systematic" in printed
+    assert "+-0.163 mm at 700 mm, of 95 in 100 points" in printed
+    assert "0.070 mm random (the median point) and 0.017 mm systematic" in printed
     assert "unknown, and not in it: calibration" in printed
-    assert "0 points on a wrong fringe or stripe; 12 with those at edges" in printed
+    assert "0 points off by half a fringe or stripe, or by 20 mm; 12 with those at edges" in printed
+
+
+def test_what_a_method_adds_unknown_gets_no_figure_of_the_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    budget = {
+        "within_mm": 0.2,
+        "depth_mm": 700.0,
+        "random_mm": 0.07,
+        "systematic_mm": 0.0,
+        "unknown": ["calibration", "method"],
+    }
+    report = {"points": 9, "coverage": {"lit": 1.0, "points_of_lit": 1.0}, "uncertainty": budget}
+    (tmp_path / "report.json").write_text(json.dumps(report), encoding="utf-8")
+    report_result(tmp_path, 1.0, {}, as_json=False)
+    printed = capsys.readouterr().out
+    assert "0.070 mm random (1 sigma of the median point) at 700 mm; unknown, and not in it" in printed
+    assert "calibration, method" in printed
+    assert "+-" not in printed

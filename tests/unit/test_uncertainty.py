@@ -21,7 +21,7 @@ from scanner.patterns import (
 from scanner.patterns.sequence import Precorrection
 from scanner.scan import build_scan
 from scanner.triangulation import triangulate
-from scanner.uncertainty import budget_of, grey_level_px
+from scanner.uncertainty import Budget, Contribution, budget_of, grey_level_px
 
 NAMES = [f"{part}.{name}" for part in ("camera", "projector") for name in LENS_MEMBERS]
 NAMES += [f"{part}.{axis}" for part in ("rotation", "translation") for axis in "xyz"]
@@ -80,6 +80,28 @@ def test_without_a_usable_covariance_it_is_unknown(scene, covariance):
     assert found is not None
     assert "calibration" in found.unknown
     assert np.isfinite(found.combined_mm)
+
+
+def drawn(sigmas, noise, seed=0):
+    """95th percentile of the magnitude of errors of these sigmas, by drawing them."""
+    return np.percentile(np.abs(sigmas * noise(np.random.default_rng(seed), sigmas.size)), 95)
+
+
+@pytest.mark.parametrize("systematic", [0.0, 0.3])
+def test_what_holds_for_95_of_100_points_is_not_of_the_median_one(systematic):
+    sigmas = np.concatenate([np.full(30_000, 0.1), np.full(10_000, 1.0)])
+    causes = (Contribution("noise", "random", 0.1, 0.1, ""), Contribution("sync", "systematic", 0.1, systematic, ""))
+    budget = Budget(700.0, causes, sigmas.astype(np.float32))
+    both = np.hypot(sigmas, systematic)
+    assert budget.within_mm == pytest.approx(drawn(both, lambda rng, n: rng.normal(size=n)), rel=0.03)
+    assert budget.within_mm > 2 * 2 * budget.combined_mm or systematic
+
+
+def test_cells_of_a_code_are_rectangular():
+    sigmas = np.full(40_000, 0.5, np.float32)
+    budget = Budget(700.0, (Contribution("quantisation", "systematic", 0.5, 0.5, ""),), sigmas)
+    assert budget.within_mm == pytest.approx(0.95 * np.sqrt(3) * 0.5, rel=1e-3)
+    assert budget.within_mm == pytest.approx(drawn(sigmas, lambda rng, n: rng.uniform(-1, 1, n) * np.sqrt(3)), rel=0.02)
 
 
 def test_sums_are_those_of_what_is_known(scene):
