@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scanner.decode import Decoded, Reason
 from scanner.decode.frames import FrameCheck
 from scanner.decode.graycode import GrayDecoder
-from scanner.decode.phase_and_code import PhaseAndCode, compare_phase_and_code
+from scanner.decode.phase_and_code import PhaseAndCode, compare_phase_and_code, require_code_order
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps
 from scanner.decode.pmp_frames import axis_frames
 from scanner.decode.reasons import REASONS
@@ -78,6 +78,7 @@ class GrayPmpDecoder:
             period = along / self._pattern.pmp.frequencies[0]
             m = of_axis.maps
             sound = (m.reason == Reason.VALUE) & (code.reason.reshape(-1) == Reason.VALUE)
+            require_code_order(cells, sound.reshape(cells.shape), axis, self._pattern.cell_px)
             agreement[axis] = compare_phase_and_code(
                 m.position, cells.reshape(-1), sound, axis, period, self._pattern.cell_px
             )
