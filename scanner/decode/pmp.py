@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scanner.decode import Decoded, Map, Reason, neighbours
 from scanner.decode.agreement import disagreements
 from scanner.decode.frames import FrameCheck
+from scanner.decode.lone_set import require_fringes
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps
 from scanner.decode.pmp_frames import axis_frames
 from scanner.decode.strips import threads_to_use
@@ -106,13 +107,14 @@ class PmpDecoder:
         """The maps. Sets that lost frames are solved from those that arrived, if there are three.
 
         Raises:
-            DecodeError: fewer than three frames of a set arrived; they are named.
+            DecodeError: fewer than three frames of a set arrived; they are named. Or there are no fringes.
         """
         warnings = self._missing()
         for axis in self._pattern.axes:
             if axis not in self._found:
                 self._decode(axis)
         for axis, found in self._found.items():
+            self._require_fringes(axis, found)
             warnings += disagreements(axis, found.remainders)
             if (changes := found.light.flicker) is not None:
                 warnings += tuple(filter(None, [changes.warning(axis, found.random_px)]))
@@ -135,6 +137,7 @@ class PmpDecoder:
             return Coordinates(whole.rows, whole.columns, whole.confidence, whole.warnings)
         warnings, (axis,) = self._missing(), self._pattern.axes
         found = self._decoded_axis(axis, brief=True)
+        self._require_fringes(axis, found)
         shape = self._camera.shape
         position, confidence = found.maps.position.reshape(shape), found.maps.confidence.reshape(shape)
         rows, columns = (position, None) if axis == "y" else (None, position)
@@ -179,6 +182,11 @@ class PmpDecoder:
             self._pattern, self._sequence.projector.along(axis), self._camera, frames,
             self._maps[axis], self._thresholds, self._threads, brief=brief,
         )  # fmt: skip
+
+    def _require_fringes(self, axis: Axis, found: AxisFound) -> None:
+        if len(self._pattern.frequencies) == 1:
+            period = self._sequence.projector.along(axis) / self._pattern.frequencies[0]
+            require_fringes(found.maps.position.reshape(self._camera.shape), period, axis)
 
     # --- the result ---------------------------------------------------------------------------------------------
 

@@ -527,3 +527,17 @@ def turns_of(p, q):
 def _turns_of(p, q, cycles):
     for i in range(0, p.size, LANES):
         store(cycles, i, _phase(load(p, i), load(q, i)))
+
+
+@pytest.mark.parametrize("brief", [False, True])
+def test_noise_is_no_fringe_where_nothing_contradicts_it(brief):
+    sequence = PatternSequence(PROJECTOR, PmpPattern(("y",), (1.0,), (3,)))
+    random = np.random.default_rng(0)
+    decoder = PmpDecoder(sequence, CAMERA)
+    for position in range(3):
+        decoder.add(position, random.integers(0, 256, CAMERA.shape).astype(CAMERA.dtype))
+    with pytest.raises(DecodeError, match="no fringes along y"):
+        decoder.coordinates() if brief else decoder.finish()
+    # Noise of a fiftieth of a cycle, and the seam of the period, are fringes all the same.
+    noisy = decode(sequence.pattern, render(sequence.pattern, noise=12.0))
+    assert np.isfinite(noisy.rows).mean() > 0.5
