@@ -218,11 +218,18 @@ def figures(live: Mapping[str, Any], sent: int | None = None) -> str:
         f"{live['dropped']:,} dropped",
         f"{live['lost']:,} lost" if live["lost"] else "",
         f"latency {_ms(latency['p50'])}, p99 {_ms(latency['p99'])}",
-        f"{live['points']:,} points" if sent is None else f"{sent:,} points sent of {live['points']:,}",
+        _points(live["points"], sent),
         "recording" if live["retain"] != "none" else "",
         f"({live['problem']})" if live["problem"] else "",
     ]
     return "  ".join(part for part in parts if part)
+
+
+def _points(whole: int, sent: int | None) -> str:
+    """Of the last second's events, and of the last result: the first result may come before the first event."""
+    if sent is None:
+        return f"{whole:,} points"
+    return f"{sent:,} points sent" + (f" of {whole:,}" if whole else "")
 
 
 def _draw(path: Path, frame: LiveFrame, caption: str) -> None:
