@@ -50,7 +50,7 @@ unfit() {
 
 # Why the rig cannot run here, in words; nothing if it can. Asks the package sources, for a minute or two at most.
 obstacle() {
-    local why missing
+    local why missing known
     why=$(unfit)
     [ -z "$why" ] || { echo "$why"; return; }
     missing=$(missing_packages | xargs)
@@ -59,7 +59,8 @@ obstacle() {
     elif [ -n "$missing" ] && [ "$(free_mb /usr)" -lt 1000 ]; then
         echo "packages are missing ($missing), they take 1000 MB, and $(free_mb /usr) MB are free in /usr"
     elif [ -n "$missing$(outdated)" ] && ! reachable; then
-        echo "the archive of Debian cannot be reached: $(archive)dists/bookworm (another in /etc/apt, or a proxy, may mend it)"
+        known=$(archive)
+        echo "the archive of Debian bookworm cannot be reached: ${known:-/etc/apt names none} (another in /etc/apt, or a proxy, may mend it)"
     elif [ -n "$missing" ] && ! can_install "$missing"; then
         echo "packages cannot be had here: $missing (another archive in /etc/apt may mend it)"
     fi
@@ -72,16 +73,15 @@ sources() {
             print "deb [signed-by=/usr/share/keyrings/debian-archive-keyring.gpg] " $1, $2, $3 }'
 }
 
-# The address of the archive, with a slash at its end.
-archive() {
-    local own
-    own=$(sources | awk '$4 == "bookworm" { print $3; exit }')
-    echo "${own:-http://deb.debian.org/debian/}"
-}
+# The address of the archive, with a slash at its end; nothing if this machine knows none (yet).
+archive() { sources | awk '$4 == "bookworm" { print $3; exit }'; }
 
-# Fetched with apt's own means: its proxies and certificates are what counts.
+# Fetched with apt's own means: its proxies and certificates are what counts. Lists may be absent: asked again after an
+# update.
 reachable() {
     local folder status=0
+    [ -n "$(archive)" ] || as_root timeout 120 apt-get update -q >/dev/null 2>&1 || return 1
+    [ -n "$(archive)" ] || return 1
     folder=$(mktemp -d)
     timeout 40 /usr/lib/apt/apt-helper -o Acquire::Retries=0 -o Acquire::http::Timeout=10 -o Acquire::https::Timeout=10 \
         download-file "$(archive)dists/bookworm/InRelease" "$folder/InRelease" >/dev/null 2>&1 || status=1
