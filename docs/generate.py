@@ -166,6 +166,8 @@ def _tables(model: Any, path: tuple[str, ...]) -> Iterator[str]:
 def _default(field: Any) -> str:
     if field.is_required():
         return "required"
+    if in_words := (field.json_schema_extra or {}).get("default in words"):
+        return str(in_words)
     if field.default in (None, "", {}):
         return ""
     return f"`{str(field.default).lower() if isinstance(field.default, bool) else field.default}`"

@@ -7,6 +7,7 @@ from difflib import get_close_matches
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
 
 from scanner.errors import ConfigError
 
@@ -29,17 +30,33 @@ def read_options(model: type[_M], options: Mapping[str, Any], device: str) -> _M
     try:
         return model.model_validate(dict(options))
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
-        if first["type"] == "extra_forbidden":
-            known = sorted(model.model_fields)
-            near = get_close_matches(key, known, n=1)
-            suggestion = f"did you mean {near[0]!r}? " if near else ""
-            raise ConfigError(
-                f"unknown option {key!r}", device=device, hint=f"{suggestion}known: {', '.join(known)}"
-            ) from error
-        raise ConfigError(
-            f"option {key or 'table'}: {first['msg']}, got {first['input']!r}",
-            device=device,
-            hint="the driver's page in docs/how-to lists its options",
-        ) from error
+        raise _error_of(error.errors(include_url=False)[0], model, device) from error
+
+
+def option_problems(model: type[Options], options: Mapping[str, Any], device: str) -> list[tuple[str, ConfigError]]:
+    """All that `read_options` would refuse, one by one: (option, error)."""
+    try:
+        model.model_validate(dict(options))
+    except ValidationError as error:
+        found = {_key(detail): _error_of(detail, model, device) for detail in error.errors(include_url=False)}
+        return list(found.items())
+    return []
+
+
+def _key(detail: ErrorDetails) -> str:
+    """The option's own name: what lies deeper within its value is wrong with it as a whole."""
+    return str(detail["loc"][0]) if detail["loc"] else ""
+
+
+def _error_of(detail: ErrorDetails, model: type[Options], device: str) -> ConfigError:
+    key = ".".join(str(part) for part in detail["loc"])
+    if detail["type"] == "extra_forbidden":
+        known = sorted(model.model_fields)
+        near = get_close_matches(key, known, n=1)
+        suggestion = f"did you mean {near[0]!r}? " if near else ""
+        return ConfigError(f"unknown option {key!r}", device=device, hint=f"{suggestion}known: {', '.join(known)}")
+    return ConfigError(
+        f"option {key or 'table'}: {detail['msg']}, got {detail['input']!r}",
+        device=device,
+        hint="the driver's page in docs/how-to lists its options",
+    )

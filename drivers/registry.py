@@ -7,7 +7,7 @@ import logging
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from difflib import get_close_matches
 from importlib.metadata import EntryPoint, entry_points
@@ -84,6 +84,22 @@ def driver_names(kind: Kind) -> list[str]:
 def check_driver(kind: Kind, name: str) -> None:
     """Raise ConfigError unless a driver of that kind and name is installed. Loads nothing."""
     _entry(kind, name)
+
+
+def option_problems(
+    kind: Kind, name: str, device: str, options: Mapping[str, Any]
+) -> Sequence[tuple[str, ConfigError]]:
+    """What that driver would refuse of a rig file without looking at a device: (option, error), option "" for `device`.
+
+    Nothing where the driver cannot tell (`scanner.devices.ChecksOptions`).
+
+    Raises:
+        ConfigError: no such driver, or it does not load.
+    """
+    from scanner.devices import ChecksOptions  # noqa: PLC0415
+
+    driver = _load(kind, name)
+    return driver.check(device, options) if isinstance(driver, ChecksOptions) else ()
 
 
 def discover() -> list[DeviceInfo]:

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from drivers.display import check_images, read_mode
-from drivers.option_table import Options, read_options
+from drivers.option_table import Options, option_problems, read_options
 from scanner.clock import Clock
 from scanner.devices import DeviceInfo, Flip, Image, Interval, ProjectorCapabilities, ProjectorKind, Source
 from scanner.errors import ConfigError, DeviceError
@@ -122,6 +122,10 @@ class StaticProjectorDriver:
     def open(self, device: str, options: Mapping[str, Any], clock: Clock) -> StaticProjector:
         """Know a slide; see `scanner.devices.ProjectorDriver.open`."""
         return StaticProjector(device, read_options(StaticOptions, options, device or DRIVER), clock)
+
+    def check(self, device: str, options: Mapping[str, Any]) -> Sequence[tuple[str, ConfigError]]:
+        """See `scanner.devices.ChecksOptions.check`."""
+        return option_problems(StaticOptions, options, device or DRIVER)
 
     def discover(self) -> Sequence[DeviceInfo]:
         """None: a slide says nothing of itself."""

@@ -1,15 +1,15 @@
 """Rig files, read and checked: devices, calibration and daemon settings in one TOML file (formats.md, Rig).
 
 What may stand in one is `service.rig_model`. An unknown key is an error with a suggestion. Errors name file, line, key,
-value and what was expected, all of them at once. Opens no device.
+value and what was expected, all of them at once. Opens no device; `service.rig_check` looks deeper.
 """
 
 from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -20,14 +20,28 @@ from pydantic_core import ErrorDetails
 from drivers.registry import Kind, check_driver
 from scanner.errors import ConfigError
 from service.rig_model import CameraConfig, ProjectorConfig, RigConfig, RigSettings, Table
+from service.toml_errors import syntax_problems
 from service.toml_lines import KeyPath, key_lines
 from service.toml_text import to_toml
 
-__all__ = ["Problem", "RigConfig", "check_rig", "is_simulated", "load_rig", "simulated_rig"]
+__all__ = [
+    "KINDS",
+    "Problem",
+    "RigConfig",
+    "RigFile",
+    "check_rig",
+    "is_simulated",
+    "load_rig",
+    "read_rig",
+    "simulated_rig",
+]
 
 DEFAULT_SIMULATED = "casey2011/bust"
 
 MAX_FILE_BYTES = 1 << 20
+
+KINDS: tuple[Kind, ...] = ("camera", "projector", "trigger")
+"""Tables that name a driver"""
 
 
 def load_rig(name: str | Path) -> RigConfig:
@@ -68,20 +82,8 @@ def check_rig(path: Path) -> tuple[RigConfig | None, list[Problem]]:
     Raises:
         ConfigError: the file cannot be read at all.
     """
-    text = _read(path)
-    try:
-        content = tomllib.loads(text)
-        lines = key_lines(text)
-    except tomllib.TOMLDecodeError as error:
-        return None, [Problem(str(path), _line_in(str(error)), "", None, f"TOML: {error}")]
-    except RecursionError:
-        return None, [Problem(str(path), None, "", None, "nested too deeply for a rig file")]
-    try:
-        rig = RigConfig.model_validate(content, context={"folder": path.absolute().parent, "stem": path.stem})
-    except ValidationError as error:
-        return None, _sorted(_problems(error, content, lines, str(path)))
-    problems = _sorted(_unusable(rig, content, lines, str(path)))
-    return (None if problems else rig), problems
+    file = read_rig(path)
+    return (None if file.problems else file.rig), file.problems
 
 
 @dataclass(frozen=True)
@@ -95,18 +97,74 @@ class Problem:
     value: Any
     """as it stands in the file; None for a missing key"""
     expected: str
+    column: int | None = None
+    """from 1; of text that is no TOML"""
+    excerpt: str = ""
+    """the line's text and a caret below the column, of text that is no TOML"""
 
     def __str__(self) -> str:
-        place = f"{self.file}:{self.line}" if self.line else self.file
+        place = ":".join(str(part) for part in (self.file, self.line, self.column) if part)
         if not self.key:
-            return f"{place}: {self.expected}"
+            return f"{place}: {self.expected}" + (f"\n{self.excerpt}" if self.excerpt else "")
         shown = "" if self.value is None else f" = {_short(self.value)}"
         return f"{place}: {self.key}{shown}: {self.expected}"
 
 
+@dataclass(frozen=True)
+class RigFile:
+    """A rig file as it stands, and what is wrong with it."""
+
+    path: Path
+    rig: RigConfig | None
+    """None where it cannot be one; there may be problems all the same"""
+    problems: list[Problem]
+    """in order of their lines"""
+    content: Mapping[str, Any] = field(default_factory=dict)
+    """the tables, as far as they can be read"""
+    lines: Mapping[KeyPath, int] = field(default_factory=dict)
+
+    def problem(self, path: KeyPath, expected: str) -> Problem:
+        """Something wrong with the key at `path`."""
+        key = ".".join(str(part) for part in path)
+        return Problem(str(self.path), _line_of(path, self.lines), key, _value_at(self.content, path), expected)
+
+    def sound(self, *path: str) -> Any:
+        """The value at `path`; None where it is absent, or where it or a table around it has a problem."""
+        keys = {".".join(path[: length + 1]) for length in range(len(path))}
+        if any(problem.key in keys for problem in self.problems):
+            return None
+        return _value_at(self.content, path)
+
+
+def read_rig(path: Path) -> RigFile:
+    """Read a rig file, with everything that is wrong with it: of one that is no TOML, what the rest of it says, too.
+
+    Raises:
+        ConfigError: the file cannot be read at all.
+    """
+    text = _read(path)
+    try:
+        broken, rest = syntax_problems(text)
+        content = {} if rest is None else tomllib.loads(rest)
+        lines = {} if rest is None else key_lines(rest)
+    except RecursionError:
+        return RigFile(path, None, [Problem(str(path), None, "", None, "nested too deeply for a rig file")])
+    problems = [Problem(str(path), one.line, "", None, f"TOML: {one.said}", one.column, one.excerpt) for one in broken]
+    if rest is None:
+        return RigFile(path, None, problems)
+    rig = None
+    try:
+        rig = RigConfig.model_validate(content, context={"folder": path.absolute().parent, "stem": path.stem})
+    except ValidationError as error:
+        problems += _problems(error, content, lines, str(path), whole=not broken)
+    file = RigFile(path, None if problems else rig, problems, content, lines)
+    return RigFile(path, file.rig, _sorted([*problems, *_unusable(file)]), content, lines)
+
+
 def _problems(
-    error: ValidationError, content: Mapping[str, Any], lines: Mapping[KeyPath, int], file: str
+    error: ValidationError, content: Mapping[str, Any], lines: Mapping[KeyPath, int], file: str, *, whole: bool
 ) -> Iterator[Problem]:
+    """whole: no line was left out, so that what is missing is missing."""
     seen: set[KeyPath] = set()
     for detail in error.errors(include_url=False):
         path = _in_document(detail, lines)
@@ -117,6 +175,8 @@ def _problems(
             expected = "unknown key" + _suggestion(path)
             value = None
         elif path not in lines:
+            if not whole:
+                continue
             expected = f"is missing: expected {_description(path)}"
             value = None
         else:
@@ -125,25 +185,23 @@ def _problems(
         yield Problem(file, _line_of(path, lines), ".".join(str(key) for key in path), value, expected)
 
 
-def _unusable(rig: RigConfig, content: Mapping[str, Any], lines: Mapping[KeyPath, int], file: str) -> Iterator[Problem]:
-    """What a well-formed rig file names that is not there."""
-    kinds: tuple[Kind, ...] = ("camera", "projector", "trigger")
-    for kind in kinds:
-        if kind not in content:
+def _unusable(file: RigFile) -> Iterator[Problem]:
+    """What a rig file names that is not there, of all that is well-formed in it."""
+    for kind in KINDS:
+        driver = file.sound(kind, "driver")
+        if driver is None:
             continue
-        path = (kind, "driver")
         try:
-            check_driver(kind, _value_at(content, path))
+            check_driver(kind, driver)
         except ConfigError as error:
-            expected = f"{error.message}; {error.hint}"
-            yield Problem(file, _line_of(path, lines), ".".join(path), _value_at(content, path), expected)
-    places: tuple[tuple[KeyPath, Path | None], ...] = (
-        (("rig", "calibration"), rig.rig.calibration),
-        (("daemon", "spool"), rig.daemon.spool),
-    )
-    for place, named in places:
-        if named is not None and (wrong := _wrong_path(named, folder=place[-1] == "spool")):
-            yield Problem(file, _line_of(place, lines), ".".join(map(str, place)), _value_at(content, place), wrong)
+            yield file.problem((kind, "driver"), f"{error.message}; {error.hint}")
+    for table, key in (("rig", "calibration"), ("rig", "marks"), ("daemon", "spool")):
+        named = file.sound(table, key)
+        if named is None:
+            continue
+        path = file.path.absolute().parent / Path(named).expanduser()
+        if wrong := _wrong_path(path, folder=key == "spool"):
+            yield file.problem((table, key), wrong)
 
 
 def _wrong_path(path: Path, *, folder: bool) -> str:
@@ -176,8 +234,14 @@ def _line_of(path: KeyPath, lines: Mapping[KeyPath, int]) -> int | None:
 
 
 def _value_at(content: Any, path: KeyPath) -> Any:
+    """None where there is none."""
     for key in path:
-        content = content[key]
+        if isinstance(content, list) and isinstance(key, int):
+            content = content[key]
+        elif isinstance(content, Mapping):
+            content = content.get(key)
+        else:
+            return None
     return content
 
 
@@ -223,7 +287,7 @@ def _places_of(name: str, within: tuple[str, ...] = ()) -> Iterator[tuple[str, .
             yield from _places_of(name, (*within, key))
 
 
-def _sorted(problems: Iterator[Problem]) -> list[Problem]:
+def _sorted(problems: Iterable[Problem]) -> list[Problem]:
     return sorted(problems, key=lambda problem: problem.line or math.inf)
 
 
@@ -234,12 +298,6 @@ def _short(value: Any) -> str:
 
 def _cut(text: str) -> str:
     return text if len(text) <= 120 else text[:117] + "..."
-
-
-def _line_in(message: str) -> int | None:
-    """The line in a message of tomllib: "... (at line 3, column 7)"."""
-    _, found, rest = message.rpartition("(at line ")
-    return int(rest.split(",")[0]) if found else None
 
 
 def _read(path: Path) -> str:

@@ -18,6 +18,7 @@ from scanner.sequencer.light import Light, measure_light
 from scanner.sequencer.picture import measure_picture
 from service.config import RigConfig
 from service.doctor import Finding, Level
+from service.rig_check import half_known
 from service.scan_setup import OpenRig, open_rig
 
 MOST_PULSING = 0.02
@@ -112,6 +113,9 @@ def latency(opened: OpenRig, clock: Clock) -> Iterator[Finding]:
     elif found.high_ns < known.low_ns or found.low_ns > known.high_ns:
         wrong = f"{said}; the {source} says {known.low_ns / 1e6:.2f} .. {known.high_ns / 1e6:.2f} ms"
         yield Finding("latency", Level.BAD, wrong, f"in [projector] write:\n{words}")
+    elif not rig.light_known:
+        half = half_known(latency=True, settle=False)
+        yield Finding("latency", Level.NOTE, f"{said}; {half}", f"in [projector] write:\n{words}")
     else:
         yield Finding("latency", Level.OK, f"{said}, as the {source} says")
 

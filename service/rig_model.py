@@ -68,7 +68,11 @@ class RigSettings(Table):
     """`[rig]`."""
 
     name: str = Field(
-        default="rig", min_length=1, max_length=100, description="a name for reports, 1 to 100 characters"
+        default="rig",
+        min_length=1,
+        max_length=100,
+        description="a name for reports, 1 to 100 characters",
+        json_schema_extra={"default in words": "the file's name without .toml"},
     )
     calibration: RelativePath | None = Field(default=None, description="path of a calibration file (JSON)")
     marks: RelativePath | None = Field(

@@ -71,15 +71,14 @@ class OpenRig:
         return {"warm_up": warmth} | ({} if self.marks is None else {"marks": self.marks})
 
     def measure_latency(self, clock: Clock) -> None:
-        """Measure the projector's latency and settling, once, where neither rig file nor driver knows them.
+        """Measure the projector's latency and settling, once, where rig file and driver do not know both.
 
         Raises:
             SyncError: black and white cannot be told apart.
             DeviceError: a device failed.
         """
-        rig, declared = self.rig, self.rig.projector.capabilities
-        known = (rig.latency or declared.latency) is not None and (rig.settle or declared.settle) is not None
-        if known or declared.kind is not ProjectorKind.FRAMEBUFFER:
+        rig = self.rig
+        if rig.light_known or rig.projector.capabilities.kind is not ProjectorKind.FRAMEBUFFER:
             return
         self.loaded = None
         latency, settle = measure_latency(

@@ -9,7 +9,7 @@ from drivers.aravis.camera import AravisCamera
 from drivers.aravis.find import find_cameras
 from drivers.aravis.library import aravis
 from drivers.aravis.options import AravisOptions
-from drivers.option_table import read_options
+from drivers.option_table import option_problems, read_options
 from scanner.clock import Clock
 from scanner.devices import DeviceInfo
 from scanner.errors import ConfigError
@@ -29,6 +29,10 @@ class AravisDriver:
         """
         aravis()
         return AravisCamera(device, read_options(AravisOptions, options, device or DRIVER), clock)
+
+    def check(self, device: str, options: Mapping[str, Any]) -> Sequence[tuple[str, ConfigError]]:
+        """See `scanner.devices.ChecksOptions.check`."""
+        return option_problems(AravisOptions, options, device or DRIVER)
 
     def discover(self) -> Sequence[DeviceInfo]:
         """The cameras that answer; none where the library is missing."""

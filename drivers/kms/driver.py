@@ -8,10 +8,10 @@ from typing import Any
 from drivers.display import DisplayOptions
 from drivers.kms.card import cards, driver_name, find, open_card, outputs
 from drivers.kms.projector import KmsProjector
-from drivers.option_table import read_options
+from drivers.option_table import option_problems, read_options
 from scanner.clock import Clock
 from scanner.devices import DeviceInfo
-from scanner.errors import DeviceError
+from scanner.errors import ConfigError, DeviceError
 
 DRIVER = "kms"
 
@@ -24,6 +24,10 @@ class KmsProjectorDriver:
         understood = read_options(DisplayOptions, options, device or DRIVER)
         node, output = find(device)
         return KmsProjector(node, output, understood, clock)
+
+    def check(self, device: str, options: Mapping[str, Any]) -> Sequence[tuple[str, ConfigError]]:
+        """See `scanner.devices.ChecksOptions.check`."""
+        return option_problems(DisplayOptions, options, device or DRIVER)
 
     def discover(self) -> Sequence[DeviceInfo]:
         """Outputs with something connected, on cards that this user may open."""

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.option_table import read_options
+from drivers.option_table import option_problems, read_options
 from drivers.serial_trigger.board import BoardOptions, SerialTriggerBoard
 from drivers.serial_trigger.link import Link
 from drivers.serial_trigger.ports import candidates, paths_for
@@ -18,7 +18,7 @@ from drivers.serial_trigger.protocol import Message
 from drivers.serial_trigger.transport import SerialTransport
 from scanner.clock import Clock
 from scanner.devices import DeviceInfo
-from scanner.errors import DeviceError, DeviceLost
+from scanner.errors import ConfigError, DeviceError, DeviceLost
 from scanner.trigger_protocol import PROTOCOL
 
 DRIVER = "serial"
@@ -50,6 +50,10 @@ class SerialTriggerDriver:
         """
         chosen = read_options(BoardOptions, options, device or "trigger board")
         return SerialTriggerBoard(lambda on_message: connect(device, clock, on_message), chosen, clock)
+
+    def check(self, device: str, options: Mapping[str, Any]) -> Sequence[tuple[str, ConfigError]]:
+        """See `scanner.devices.ChecksOptions.check`."""
+        return option_problems(BoardOptions, options, device or "trigger board")
 
     def discover(self) -> Sequence[DeviceInfo]:
         """Ports that may be trigger boards, by their USB numbers; none is opened."""

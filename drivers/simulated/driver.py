@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from drivers.simulated.camera import SimulatedCamera
-from drivers.simulated.options import DEFAULT_SCENE, read_settings
+from drivers.simulated.options import DEFAULT_SCENE, Settings, read_settings, setting_problems
 from drivers.simulated.projector import SimulatedProjector
 from drivers.simulated.rigs import rig, rig_names
 from drivers.simulated.scenes import scene_names
@@ -35,6 +35,10 @@ class SimulatedCameraDriver:
         name = _name(settings.world.rig, settings.world.scene, "camera")
         return SimulatedCamera(enter_world(settings, clock, name), settings, name)
 
+    def check(self, device: str, options: Mapping[str, Any]) -> Sequence[tuple[str, ConfigError]]:
+        """See `scanner.devices.ChecksOptions.check`."""
+        return setting_problems(device, options, "camera")
+
     def discover(self) -> Sequence[DeviceInfo]:
         """One camera for each reference rig."""
         return [_info(name, "camera") for name in rig_names()]
@@ -45,18 +49,24 @@ class SimulatedProjectorDriver:
 
     def open(self, device: str, options: Mapping[str, Any], clock: Clock) -> SimulatedProjector:
         """Open the projector of a simulated world; see `SimulatedCameraDriver.open`."""
-        mode = options.get("mode")
-        settings = read_settings(device, {k: v for k, v in options.items() if k != "mode"}, "projector")
+        mode, others = _mode_apart(options)
+        settings = read_settings(device, others, "projector")
+        _check_mode(mode, settings)
         name = _name(settings.world.rig, settings.world.scene, "projector")
-        width, height = rig(settings.world.rig).calibration.projector.size
-        if mode is not None and str(mode).partition("@")[0] != f"{width}x{height}":
-            raise ConfigError(
-                f"the simulated projector has one mode, {width}x{height}, and not {mode}",
-                device=name,
-                hint="leave projector.mode out; another rig of `fringed devices` has another projector",
-            )
         made = SimulatedSequencedProjector if settings.projector.kind == "sequencer" else SimulatedProjector
         return made(enter_world(settings, clock, name), settings, name)
+
+    def check(self, device: str, options: Mapping[str, Any]) -> Sequence[tuple[str, ConfigError]]:
+        """See `scanner.devices.ChecksOptions.check`."""
+        mode, others = _mode_apart(options)
+        found = setting_problems(device, others, "projector")
+        if any(option == "" for option, _ in found):
+            return found  # which projector it is, and so its size, is not known
+        try:
+            _check_mode(mode, read_settings(device, {}, "projector"))
+        except ConfigError as error:
+            found.append(("mode", error))
+        return found
 
     def discover(self) -> Sequence[DeviceInfo]:
         """One projector for each reference rig."""
@@ -72,6 +82,10 @@ class SimulatedTriggerDriver:
         name = _name(settings.world.rig, settings.world.scene, "trigger board")
         return SimulatedTriggerBoard(enter_world(settings, clock, name), settings, name)
 
+    def check(self, device: str, options: Mapping[str, Any]) -> Sequence[tuple[str, ConfigError]]:
+        """See `scanner.devices.ChecksOptions.check`."""
+        return setting_problems(device, options, "trigger")
+
     def discover(self) -> Sequence[DeviceInfo]:
         """One board for each reference rig."""
         details = {"steps": CAPABILITIES.max_steps, "scenes": list(scene_names())}
@@ -79,6 +93,23 @@ class SimulatedTriggerDriver:
             DeviceInfo(DRIVER, f"{name}/{DEFAULT_SCENE}", "trigger", f"simulated rig {name}", details)
             for name in rig_names()
         ]
+
+
+def _mode_apart(options: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
+    """The rig file's `projector.mode`, and the projector's own options."""
+    return options.get("mode"), {key: value for key, value in options.items() if key != "mode"}
+
+
+def _check_mode(mode: Any, settings: Settings) -> None:
+    """Raise ConfigError where a mode is wanted that is not the projector's size."""
+    world = settings.world
+    width, height = rig(world.rig).calibration.projector.size
+    if mode is not None and str(mode).partition("@")[0] != f"{width}x{height}":
+        raise ConfigError(
+            f"the simulated projector has one mode, {width}x{height}, and not {mode}",
+            device=_name(world.rig, world.scene, "projector"),
+            hint="leave projector.mode out; another rig of `fringed devices` has another projector",
+        )
 
 
 def _name(rig_name: str, scene: str, role: str) -> str:

@@ -192,6 +192,23 @@ def read_settings(device: str, options: Mapping[str, Any], side: Side) -> Settin
     )
 
 
+def setting_problems(device: str, options: Mapping[str, Any], side: Side) -> list[tuple[str, ConfigError]]:
+    """All that `read_settings` would refuse, one by one: (option, error), option "" for the device string."""
+    place, _, query = device.partition("?")
+    parts: list[tuple[str, str, Mapping[str, Any]]] = [("", place, {})]
+    parts += [("", f"?{pair}", {}) for pair in query.split("&") if query]
+    for key, value in options.items():
+        of_table = key == "faults" and isinstance(value, Mapping)
+        parts += [(key, "", {key: one}) for one in ([{name: value[name]} for name in value] if of_table else [value])]
+    found = []
+    for key, said, table in parts:
+        try:
+            read_settings(said, table, side)
+        except ConfigError as error:
+            found.append((key, error))
+    return found
+
+
 def check_same_world(settings: Settings, world: WorldSettings, device: str) -> None:
     """Raise ConfigError where a key that was given contradicts the world that the other device has opened."""
     for key in sorted(settings.world_keys):

@@ -6,13 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from drivers.option_table import read_options
+from drivers.option_table import option_problems, read_options
 from drivers.v4l2.camera import V4l2Camera
 from drivers.v4l2.node import VideoNode, find, nodes
 from drivers.v4l2.options import CameraOptions, OutputOptions
 from drivers.v4l2.output import V4l2Output
 from scanner.clock import Clock
 from scanner.devices import DeviceInfo
+from scanner.errors import ConfigError
 
 DRIVER = "v4l2"
 
@@ -27,6 +28,10 @@ class V4l2CameraDriver:
         understood = read_options(CameraOptions, options, device or DRIVER)
         return V4l2Camera(find(device, "camera"), understood, clock)
 
+    def check(self, device: str, options: Mapping[str, Any]) -> Sequence[tuple[str, ConfigError]]:
+        """See `scanner.devices.ChecksOptions.check`."""
+        return option_problems(CameraOptions, options, device or DRIVER)
+
     def discover(self) -> Sequence[DeviceInfo]:
         """Cameras that this user may open."""
         return [_info(node, "camera") for node in nodes("camera")]
@@ -39,6 +44,10 @@ class V4l2ProjectorDriver:
         """Open one output; see `scanner.devices.ProjectorDriver.open`."""
         understood = read_options(OutputOptions, options, device or DRIVER)
         return V4l2Output(find(device, "projector"), understood, clock)
+
+    def check(self, device: str, options: Mapping[str, Any]) -> Sequence[tuple[str, ConfigError]]:
+        """See `scanner.devices.ChecksOptions.check`."""
+        return option_problems(OutputOptions, options, device or DRIVER)
 
     def discover(self) -> Sequence[DeviceInfo]:
         """Outputs that this user may open."""

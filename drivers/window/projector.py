@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from drivers.display import DisplayOptions, check_images, read_mode
-from drivers.option_table import read_options
+from drivers.option_table import option_problems, read_options
 from drivers.window import sdl
 from scanner.clock import Clock
 from scanner.devices import DeviceInfo, Flip, Image, ProjectorCapabilities, Source
@@ -152,6 +152,10 @@ class WindowProjectorDriver:
     def open(self, device: str, options: Mapping[str, Any], clock: Clock) -> WindowProjector:
         """Open a window; see `scanner.devices.ProjectorDriver.open`."""
         return WindowProjector(device, read_options(WindowOptions, options, device or DRIVER), clock)
+
+    def check(self, device: str, options: Mapping[str, Any]) -> Sequence[tuple[str, ConfigError]]:
+        """See `scanner.devices.ChecksOptions.check`."""
+        return option_problems(WindowOptions, options, device or DRIVER)
 
     def discover(self) -> Sequence[DeviceInfo]:
         """The desktop's displays; none without SDL or without a desktop."""

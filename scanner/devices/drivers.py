@@ -10,6 +10,7 @@ from scanner.clock import Clock
 from scanner.devices.cameras import Camera
 from scanner.devices.projectors import Projector
 from scanner.devices.triggers import TriggerBoard
+from scanner.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -62,9 +63,9 @@ class TriggerDriver(Protocol):
 class ChecksOptions(Protocol):
     """A driver that can judge what a rig file says to it without any device: `fringed check-config` asks."""
 
-    def check(self, device: str, options: Mapping[str, Any]) -> None:
-        """Look at what `open` would be given, as far as no device is needed. Opens nothing.
+    def check(self, device: str, options: Mapping[str, Any]) -> Sequence[tuple[str, ConfigError]]:
+        """What `open` would refuse, given the same, as far as that needs no device. Opens nothing.
 
-        Raises:
-            ConfigError: device or options make no sense to this driver.
+        Returns:
+            (option, error) each; option "" where it is the device string that makes no sense.
         """

@@ -33,6 +33,12 @@ class Rig:
     mirror: bool = False
     rotate: Literal[0, 180] = 0
 
+    @property
+    def light_known(self) -> bool:
+        """Whether latency and settling are both known, each from the rig file or the driver: one proves nothing."""
+        declared = self.projector.capabilities
+        return (self.latency or declared.latency) is not None and (self.settle or declared.settle) is not None
+
     def plan(self, sequence: PatternSequence, **options: Any) -> Plan:
         """`plan` with this rig's devices and measured values; options are those of `plan` and go before the rig's."""
         own: dict[str, Any] = {

@@ -19,54 +19,38 @@ def check_config(
     file: Annotated[str, typer.Argument(metavar="FILE", help="A rig file (TOML), or simulated[:SCENE].")],
     as_json: AsJson = False,
 ) -> int:
-    """Check a rig file: keys, values, drivers, calibration. Opens no device.
+    """Check a rig file: keys, values, drivers and their options, scenes, modes, calibration. Opens no device.
+
+    All problems are named at once. What only a device can say, fringed doctor --rig FILE finds.
 
     \b
     Examples:
       fringed check-config docs/examples/rig.toml
       fringed check-config simulated:quick/board --json
     """
-    from service.config import check_rig, is_simulated, load_rig  # noqa: PLC0415
+    from service.config import is_simulated  # noqa: PLC0415
+    from service.rig_check import examine, examine_simulated  # noqa: PLC0415
 
-    rig, problems = (load_rig(file), []) if is_simulated(file) else check_rig(Path(file))
-    lines = [str(problem) for problem in problems]
-    odd: list[str] = []
-    if rig is not None:
-        found, odd = _calibration_problems(rig, file)
-        lines += found
+    found = examine_simulated(file) if is_simulated(file) else examine(Path(file))
+    rig = found.rig
     if as_json:
         print_json(
             {
-                "ok": not lines,
-                "problems": [asdict(problem) for problem in problems] or lines,
-                "warnings": odd,
+                "ok": rig is not None,
+                "problems": [asdict(problem) for problem in found.problems],
+                "warnings": found.warnings,
                 "rig": None if rig is None else rig.model_dump(mode="json"),
             }
         )
-    for line in lines:
-        print_error(line)
-    for line in odd:
+    for problem in found.problems:
+        print_error(str(problem))
+    for line in found.warnings:
         print_error(line, label="warning")
-    if lines or rig is None:
+    if rig is None:
         return 1
     if not as_json:
         print_facts(f"{file}: OK", _meaning(rig))
     return 0
-
-
-def _calibration_problems(rig: RigConfig, file: str) -> tuple[list[str], list[str]]:
-    """What is wrong with the rig's calibration, and what is odd about it."""
-    if rig.rig.calibration is None:
-        return [], []
-    from scanner.errors import CalibrationError  # noqa: PLC0415
-    from scanner.geometry import load_calibration  # noqa: PLC0415
-
-    where = f"{file}: rig.calibration"
-    try:
-        calibration = load_calibration(rig.rig.calibration)
-    except CalibrationError as error:
-        return [f"{where}: {error}" + (f" ({error.hint})" if error.hint else "")], []
-    return [], [f"{where}: {said}" for said in calibration.warnings]
 
 
 def _meaning(rig: RigConfig) -> list[tuple[str, Any]]:
@@ -85,7 +69,10 @@ def _meaning(rig: RigConfig) -> list[tuple[str, Any]]:
         ("exposure", f"{exposure:g} us" if isinstance(exposure, float | int) else "auto: test shots before each scan"),
         ("triggered by", rig.trigger.driver if rig.trigger else settings.trigger_mode or "the planner's choice"),
         ("projector", f"{projector.driver} {projector.device} {projector.mode or ''}".strip()),
-        ("latency, settle", "measured" if known else "as the device declares; without either nothing is proved"),
+        (
+            "latency, settle",
+            "as the file says" if known else "as the driver declares, or measured before the first scan",
+        ),
         ("endpoint", daemon.endpoint),
         ("spool", daemon.spool or "in the daemon's state folder"),
         ("captures leave", ", ".join(ends)),

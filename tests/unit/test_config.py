@@ -198,7 +198,7 @@ def test_what_a_rig_names_must_be_there(rig_file: Path) -> None:
 
 
 def test_files_that_are_no_rig_files(rig_file: Path, tmp_path: Path) -> None:
-    assert f"{rig_file}:2: TOML:" in refusal(rig_file, "[rig]\nname = \n")
+    assert f"{rig_file}:2:8: TOML:" in refusal(rig_file, "[rig]\nname = \n")
     assert "nested too deeply" in refusal(rig_file, "a = " + 3000 * "[" + 3000 * "]")
     assert "nested too deeply" in refusal(rig_file, "a = " + 3000 * "[")
     for content, expected in ((b"\xff\xfe\x00", "UTF-8"), (b"#" * (1 << 21), "larger")):

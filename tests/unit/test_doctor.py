@@ -151,6 +151,14 @@ def test_a_latency_that_is_not_what_the_rig_file_says_is_bad() -> None:
     assert "rig file" in found.says
 
 
+def test_a_latency_without_a_settling_is_judged_as_check_config_judges_it() -> None:
+    device = {"driver": "simulated", "device": "quick/board?declare_latency=false"}
+    found = one(examined(device["device"], projector={**device, "latency_us": [4_000, 4_400]}), "latency")
+    assert found.level is Level.NOTE
+    assert "latency_us without settle_us" in found.says
+    assert "settle_us = [" in found.mend
+
+
 def test_greys_made_of_pulses_are_seen() -> None:
     assert "constant" in one(examined("quick/board"), "grey").says
     assert "pulses" in one(examined("quick/board?modulation=pwm"), "grey").says
