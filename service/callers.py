@@ -30,6 +30,10 @@ MAX_WAITING_BYTES = 16 << 20
 ANSWERS_HELD = 32
 """Answers that ZeroMQ holds for one caller: a caller that fetches and never reads costs 128 MB of memory, not 40 GB."""
 
+REFUSALS_HELD, REFUSAL_BYTES = 32_768, 1024
+"""Answers that wait for a caller that floods and does not read, and the length up to which a refusal may be one of them
+(it repeats the call's id): 32 MB at most. Calls beyond are dropped without a word, as nothing else has a bound."""
+
 BATCH = 64
 """Calls taken from the socket before everything else has its turn."""
 
@@ -95,7 +99,9 @@ class Callers:
         caller = self._callers.setdefault(address[0], _Caller())
         length = sum(len(part) for part in body)
         if len(caller.waiting) >= MAX_WAITING or caller.waiting_bytes + length > MAX_WAITING_BYTES:
-            self._tell(caller, [*address, self._refuse(body, len(caller.waiting))], may_wait=False)
+            refusal = self._refuse(body, len(caller.waiting))
+            fits = len(refusal) <= REFUSAL_BYTES and len(caller.unread) < REFUSALS_HELD
+            self._tell(caller, [*address, refusal], may_wait=fits)
             return
         caller.waiting.append((address, body))
         caller.waiting_bytes += length
@@ -130,10 +136,10 @@ class Callers:
         pause, identity = RETRY_S, caller.unread[0][0]
         while caller.unread:
             await asyncio.sleep(pause)
-            outcome = Sent.DONE
-            while caller.unread and (outcome := try_send(self._socket, caller.unread[0])) is not Sent.FULL:
+            before = len(caller.unread)
+            while caller.unread and try_send(self._socket, caller.unread[0]) is not Sent.FULL:
                 caller.unread.popleft()
-            pause = min(2 * pause, RETRY_MOST_S) if outcome is Sent.FULL else RETRY_S
+            pause = min(2 * pause, RETRY_MOST_S) if len(caller.unread) == before else RETRY_S
         self._begin(caller)
         self._forget(identity, caller)
 

@@ -91,6 +91,21 @@ async def test_slow_calls_of_one_leave_room_for_others(tmp_path: Path) -> None:
         assert [await read(many) for _ in range(3 * AT_ONCE)] == [b"slow"] * 3 * AT_ONCE
 
 
+async def test_every_refusal_reaches_a_flooding_caller_that_reads_late(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(callers, "MAX_WAITING", 5)
+    async with serving(tmp_path, echo) as connected:
+        many, one = connected(), connected()
+        for number in range(FLOOD):
+            await many.send(b"%d" % number)
+        await one.send(b"one")
+        assert (await read(one)).startswith(b"one")
+        found = [await read(many) for _ in range(FLOOD)]
+        assert found.count(b"refused") > FLOOD / 2
+        assert len([answer for answer in found if answer != b"refused"]) >= AT_ONCE
+
+
 async def test_what_is_too_much_is_refused_and_a_caller_that_left_forgotten(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
