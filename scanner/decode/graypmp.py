@@ -78,7 +78,9 @@ class GrayPmpDecoder:
             period = along / self._pattern.pmp.frequencies[0]
             m = of_axis.maps
             sound = (m.reason == Reason.VALUE) & (code.reason.reshape(-1) == Reason.VALUE)
-            require_code_order(cells, sound.reshape(cells.shape), axis, self._pattern.cell_px)
+            beyond = int(np.count_nonzero((m.reason == Reason.VALUE) & (code.reason.reshape(-1) == Reason.BORDER)))
+            plain = self._pattern.gray.code == "gray"
+            require_code_order(cells, sound.reshape(cells.shape), beyond, axis, self._pattern.cell_px, gray=plain)
             agreement[axis] = compare_phase_and_code(
                 m.position, cells.reshape(-1), sound, axis, period, self._pattern.cell_px
             )

@@ -47,9 +47,20 @@ follow the code point anywhere, and their mean is short."""
 
 MOST_JUMPS = 0.1
 """Of the borders between cells, those where the number changes by two or more: edges of depth. Eleven simulated scenes
-have .016 at most, code images out of order .15 and more; only coarse bits that change places make few borders."""
+have .016 at most, code images out of order .15 and more. Coarse bits make few borders, and are judged one by one."""
 
 LEAST_BORDERS = 500
+
+MOST_JUMPS_OF_BIT = 0.5
+"""Of the borders where one bit of the Gray code changes and no other, those where the number changes by two or more.
+Two images that changed places make both bits jump at every border, however few they have. One bit alone may: along an
+edge of depth that hides its borders and happens to lie halfway."""
+
+LEAST_BORDERS_OF_BIT = 100
+
+MOST_BEYOND = 0.02
+"""Of the pixels that show fringes, those whose cell lies beyond the projector, where no light comes from: none in nine
+simulated scenes; .04 to .22 where coarse bits changed places and the projector uses a part of their cells."""
 
 
 @dataclass(frozen=True)
@@ -139,21 +150,51 @@ def compare_phase_and_code(
     )
 
 
-def require_code_order(cells: NDArray[np.float32], sound: NDArray[np.bool_], axis: Axis, cell_px: float) -> None:
+def require_code_order(
+    cells: NDArray[np.float32], sound: NDArray[np.bool_], beyond: int, axis: Axis, cell_px: float, *, gray: bool
+) -> None:
     """Raise DecodeError where numbers of neighbouring cells jump: the code's images are not in the order described.
 
     Args:
         cells: (H, W) projector px, the middle of the cell that the code names. sound: (H, W) where it was read.
-        axis, cell_px: see `compare_phase_and_code`.
+        beyond: how many more pixels name a cell beyond the projector.
+        axis, cell_px: see `compare_phase_and_code`. gray: whether neighbouring cells differ in one bit.
     """
-    borders = jumps = 0
+    numbers = np.zeros(cells.shape, np.int32)
+    numbers[sound] = np.floor((cells[sound] + 0.5) / cell_px)
+    borders, jumps, of_bits = 0, 0, np.zeros((32, 2), np.int64)
     for here, there in (np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1]):
-        steps = np.abs(cells[here] - cells[there])[sound[here] & sound[there]]
-        borders += int(np.count_nonzero(steps > 0.5 * cell_px))
-        jumps += int(np.count_nonzero(steps > 1.5 * cell_px))
+        on_border = sound[here] & sound[there] & (numbers[here] != numbers[there])
+        one, other = numbers[here][on_border], numbers[there][on_border]
+        jumped = np.abs(one - other) > 1
+        borders += jumped.size
+        jumps += int(np.count_nonzero(jumped))
+        of_bits += _borders_of_bits(one, other, jumped)
+    said = f"along {axis} the Gray code jumps at"
     if borders >= LEAST_BORDERS and jumps > MOST_JUMPS * borders:
-        raise DecodeError(
-            f"along {axis} the Gray code jumps at {100 * jumps / borders:.0f} % of the borders of its cells: "
-            "its frames are not in the order described",
-            hint='compare the description\'s "bits", "code" and order of frames with what was projected',
+        said += f" {100 * jumps / borders:.0f} % of the borders of its cells"
+    elif gray and len(exchanged := _jumping_bits(of_bits)) > 1:
+        said += f" borders where one bit changes, of {len(exchanged)} bits"
+    elif beyond > MOST_BEYOND * (seen := beyond + np.count_nonzero(sound)):
+        said = (
+            f"along {axis} the Gray code names cells beyond the projector at {100 * beyond / seen:.0f} % of the pixels"
         )
+    else:
+        return
+    raise DecodeError(
+        f"{said}: its frames are not in the order described",
+        hint='compare the description\'s "bits", "code" and order of frames with what was projected',
+    )
+
+
+def _jumping_bits(borders: NDArray[np.int64]) -> NDArray[np.intp]:
+    whole = np.maximum(borders.sum(axis=1), LEAST_BORDERS_OF_BIT)
+    return np.flatnonzero(borders[:, 1] > MOST_JUMPS_OF_BIT * whole)
+
+
+def _borders_of_bits(one: NDArray[np.int32], other: NDArray[np.int32], jumped: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(32, 2) borders at which this bit of the Gray code changes and no other, to the next cell and to one further."""
+    changed = (one ^ one >> 1) ^ (other ^ other >> 1)
+    alone = changed & (changed - 1) == 0
+    bits = np.frexp(changed[alone].astype(np.float64))[1] - 1
+    return np.bincount(bits * 2 + jumped[alone], minlength=64).reshape(32, 2)
