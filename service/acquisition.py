@@ -15,7 +15,7 @@ from msgspec import to_builtins
 from scanner.capture import CaptureHeader, CaptureWriter, FrameRecord, State
 from scanner.clock import Clock
 from scanner.devices import Image, KnowsTruth
-from scanner.errors import ConfigError, DeviceLost, ScannerError, StorageError
+from scanner.errors import ConfigError, DeviceLost, ScannerError, StorageError, SyncError
 from scanner.patterns import CameraFormat
 from scanner.sequencer import Acquisition, FinishReason, Plan, acquire
 from scanner.storage import replace_json, storage_errors
@@ -119,18 +119,26 @@ class Scan:
                 disk.close("failed", reason_of(error), (), self._ended_by(error))
                 return
             self.lost = outcome.error if isinstance(outcome.error, DeviceLost) else None
-            state: State = "complete" if outcome.reason is FinishReason.COMPLETED else "failed"
+            completed = outcome.reason is FinishReason.COMPLETED
+            # Before anything waits for a disk: clients wait for this word.
+            self._say(Taken(self.job, self._lines if completed and not outcome.missing else None))
+            state: State = "complete" if completed else "failed"
             disk.close(state, outcome.reason.value, outcome.witnesses.as_list(), self._ended_with(outcome))
-        self._say(Taken(self.job))
 
     def _ended_with(self, outcome: Acquisition) -> Callable[[StorageError | None], None]:
         def say(problem: StorageError | None) -> None:
-            error = problem or outcome.error
+            error = problem or self._with_timing(outcome.error)
             reason: EndReason = "disk_full" if problem is not None else outcome.reason.value
             body = None if error is None else error_body(error)
             self._say(Ended(self.job, reason, self._lines, list(outcome.missing), body, outcome.report()))
 
         return say
+
+    def _with_timing(self, error: ScannerError | None) -> ScannerError | None:
+        """A scan that is out of step by a latency that is not the projector's says so."""
+        if isinstance(error, SyncError) and (said := self._opened.disagreement) is not None:
+            error.hint = said
+        return error
 
     def _ended_by(self, error: ScannerError) -> Callable[[StorageError | None], None]:
         # On a disk that is full the folder cannot be closed: it stays `open`, which says that it was interrupted.

@@ -19,7 +19,7 @@ from scanner.sequencer.picture import measure_picture
 from service.config import RigConfig
 from service.doctor import Finding, Level
 from service.rig_check import half_known
-from service.scan_setup import OpenRig, open_rig
+from service.scan_setup import OpenRig, open_rig, timing_lines
 
 MOST_PULSING = 0.02
 """Of a grey over phases of the refresh: below, a part of a refresh sees a grey to two hundredths, as noise does"""
@@ -99,10 +99,7 @@ def latency(opened: OpenRig, clock: Clock) -> Iterator[Finding]:
     found, settle = measure_latency(
         rig.projector, rig.camera, clock, settings=rig.settings, trigger_mode=rig.trigger_mode
     )
-    words = (
-        f"latency_us = [{found.low_ns // 1000}, {-(-found.high_ns // 1000)}]\n"
-        f"settle_us = [{settle.low_ns // 1000}, {-(-settle.high_ns // 1000)}]"
-    )
+    words = timing_lines(found, settle)
     said = f"{found.low_ns / 1e6:.2f} .. {found.high_ns / 1e6:.2f} ms, settled {settle.high_ns / 1e6:.2f} ms later"
     known, source = rig.latency or declared.latency, "rig file" if rig.latency else "driver"
     if found.low_ns == 0 and found.high_ns > declared.refresh_ns // 4:

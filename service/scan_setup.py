@@ -13,10 +13,11 @@ from typing import Any
 from drivers import registry
 from scanner.clock import Clock
 from scanner.devices import CameraSettings, Interval, KnowsTemperature, KnowsTruth, ProjectorKind, TriggerMode
-from scanner.errors import ConfigError, DecodeError, DeviceError
+from scanner.errors import ConfigError, DecodeError, DeviceError, DeviceLost, SyncError
 from scanner.geometry import Calibration, load_calibration
 from scanner.patterns import McpPattern, PatternSequence, ProjectorSize
 from scanner.sequencer import Rig, auto_exposure, measure_latency
+from scanner.sequencer.latency import Disagreement, disagreement
 from scanner.wire import ScanStart
 from service.rig_patterns import KnownRig, known_of
 from service.scan_patterns import check_length, pattern_for
@@ -38,6 +39,10 @@ class OpenRig:
     """when the devices were opened, by the clock they live in"""
     marks: Mapping[str, Any] | None = None
     """witness marks of the rig file, as `Marks.as_dict` has them"""
+    latency_checked: bool = False
+    """whether the rig file's latency was held against the light already"""
+    disagreement: str | None = None
+    """what is wrong with it"""
 
     @property
     def projector(self) -> ProjectorSize:
@@ -68,23 +73,51 @@ class OpenRig:
                 warmth["camera_c"] = camera.temperature_c()
             except DeviceError as error:  # a scan needs no thermometer
                 _log.warning("%s: its temperature was not read: %s", camera.name, error)
-        return {"warm_up": warmth} | ({} if self.marks is None else {"marks": self.marks})
+        timing = {} if self.disagreement is None else {"timing": {"warning": self.disagreement}}
+        return {"warm_up": warmth} | ({} if self.marks is None else {"marks": self.marks}) | timing
 
     def measure_latency(self, clock: Clock) -> None:
         """Measure the projector's latency and settling, once, where rig file and driver do not know both.
+
+        What the rig file says is held against one flip, once, and believed all the same: a scan warns of it.
 
         Raises:
             SyncError: black and white cannot be told apart.
             DeviceError: a device failed.
         """
         rig = self.rig
-        if rig.light_known or rig.projector.capabilities.kind is not ProjectorKind.FRAMEBUFFER:
+        if rig.projector.capabilities.kind is not ProjectorKind.FRAMEBUFFER:
             return
-        self.loaded = None
-        latency, settle = measure_latency(
-            rig.projector, rig.camera, clock, settings=rig.settings, trigger_mode=rig.trigger_mode
-        )
-        self.rig = replace(rig, latency=latency, settle=settle)
+        if not rig.light_known:
+            self.loaded = None
+            latency, settle = measure_latency(
+                rig.projector, rig.camera, clock, settings=rig.settings, trigger_mode=rig.trigger_mode
+            )
+            self.rig = replace(rig, latency=latency, settle=settle)
+            self.latency_checked = True
+        elif rig.latency is not None and not self.latency_checked:
+            self._check_latency(clock, rig.latency, rig.settle or rig.projector.capabilities.settle or Interval(0, 0))
+
+    def _check_latency(self, clock: Clock, latency: Interval, settle: Interval) -> None:
+        self.loaded, self.latency_checked = None, True
+        rig = self.rig
+        try:
+            found = disagreement(
+                rig.projector,
+                rig.camera,
+                clock,
+                (latency, settle),
+                settings=rig.settings,
+                trigger_mode=rig.trigger_mode,
+            )
+        except DeviceLost:
+            raise
+        except (ConfigError, SyncError, DeviceError) as error:  # the scan itself says what it cannot work with
+            _log.info("%s: its latency was not checked: %s", rig.projector.name, error)
+            return
+        if found is not None:
+            self.disagreement = _disagreement(latency, found)
+            _log.warning("%s: %s", rig.projector.name, self.disagreement)
 
     def exposure_for(
         self, clock: Clock, sequence: PatternSequence, given: float | str | None = None
@@ -219,6 +252,31 @@ def _marks(path: str | None) -> dict[str, Any] | None:
     from scanner.calibration.marks import load_marks  # noqa: PLC0415  (brings detection; few rigs have marks)
 
     return load_marks(Path(path)).as_dict()
+
+
+def timing_values(latency: Interval, settle: Interval) -> dict[str, list[int]]:
+    """Measured times as the rig file's table [projector] has them: whole microseconds, rounded outwards."""
+    times = (("latency_us", latency), ("settle_us", settle))
+    return {name: [interval.low_ns // 1000, -(-interval.high_ns // 1000)] for name, interval in times}
+
+
+def timing_lines(latency: Interval, settle: Interval) -> str:
+    """The same as lines of that table."""
+    return "\n".join(f"{name} = {values}" for name, values in timing_values(latency, settle).items())
+
+
+def _disagreement(given: Interval, found: Disagreement) -> str:
+    wrong = "too long: every frame waits for it" if found.off_ns > 0 else "too short: frames may show another pattern"
+    lines = timing_lines(found.latency, found.settle).replace("\n", " and ")
+    return (
+        f"the rig file's latency_us, {_ms(given)}, is {abs(found.off_ns) / 1e6:.1f} ms {wrong}; light came "
+        f"{_ms(found.latency)} after the flip. In [projector] write {lines}"
+    )
+
+
+def _ms(interval: Interval) -> str:
+    low, high = (f"{ns / 1e6:.1f}" for ns in (interval.low_ns, interval.high_ns))
+    return f"{low} ms" if low == high else f"{low} .. {high} ms"
 
 
 def _interval(microseconds: Any) -> Interval | None:

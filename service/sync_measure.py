@@ -17,7 +17,7 @@ from scanner.sequencer import measure_latency
 from scanner.sequencer.light import Light, measure_light
 from service.config import RigConfig
 from service.scan_patterns import default_pattern
-from service.scan_setup import OpenRig, open_rig
+from service.scan_setup import OpenRig, open_rig, timing_values
 
 ROUNDS, MOST_ROUNDS = 3, 6
 """Searches for the light's begin and end, each with flips of its own: their union covers what jitters slowly. More
@@ -40,11 +40,8 @@ class Sync:
     """why nothing works, in words"""
 
     def rig_lines(self) -> dict[str, list[int]]:
-        """Values for `[projector]`, whole microseconds, rounded outwards."""
-        return {
-            name: [interval.low_ns // 1000, -(-interval.high_ns // 1000)]
-            for name, interval in (("latency_us", self.latency), ("settle_us", self.settle))
-        }
+        """Values for `[projector]`."""
+        return timing_values(self.latency, self.settle)
 
     @property
     def is_poor(self) -> bool:

@@ -1,4 +1,4 @@
-"""What capture.json tells of the exposure: what was asked, what was used, and what test shots had to say about it.
+"""What capture.json tells of exposure and timing: what was asked, what was used, and what test shots had to say.
 
 Captures made elsewhere need not tell anything, and what they tell is not trusted to be well formed.
 """
@@ -23,10 +23,11 @@ def exposure_report(header: CaptureHeader) -> dict[str, Any] | None:
 
 
 def exposure_warnings(header: CaptureHeader) -> tuple[str, ...]:
-    """What a user should know: test shots too bright or too dim, an exposure that is not the one asked for."""
-    warnings = []
-    if isinstance(warning := _told(header).get("warning"), str):
-        warnings.append(warning)
+    """What a user should know: test shots too bright or too dim, an exposure that is not the one asked for, and a
+    latency in the rig file that was not the projector's before the scan.
+    """
+    said = (_told(header).get("warning"), _told(header, "timing").get("warning"))
+    warnings = [warning for warning in said if isinstance(warning, str)]
     report = exposure_report(header)
     if report is not None and (asked := report["asked_us"]) and abs(report["used_us"] - asked) > SAME * asked:
         why = ((header.plan or {}).get("why") or {}).get("exposure_ns")
@@ -35,8 +36,8 @@ def exposure_warnings(header: CaptureHeader) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def _told(header: CaptureHeader) -> Mapping[str, Any]:
-    told = header.extra.get("exposure")
+def _told(header: CaptureHeader, of: str = "exposure") -> Mapping[str, Any]:
+    told = header.extra.get(of)
     return told if isinstance(told, Mapping) else {}
 
 

@@ -42,6 +42,8 @@ class _Sample:
     end_ns: int
     dark: bool
     full: bool
+    bound_ns: int
+    """taken off at both ends"""
 
 
 def measure(
@@ -81,6 +83,62 @@ def measure(
             samples += _burst(shots, scale, _where_next(samples, begin=i % 2 == 0), shots.light_delay_ns)
         shots.show(BLACK)
     return _intervals(samples, scale.tolerance)
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """A latency that is given and not what the camera sees."""
+
+    latency: Interval
+    settle: Interval
+    """measured"""
+    off_ns: int
+    """the given one is too long (positive) or too short by this at least"""
+
+
+def disagreement(
+    projector: Projector,
+    camera: Camera,
+    clock: Clock,
+    given: tuple[Interval, Interval],
+    *,
+    settings: CameraSettings | None = None,
+    trigger_mode: TriggerMode | None = None,
+) -> Disagreement | None:
+    """Look at one flip, a third of a second, and measure in earnest where it contradicts `given` (latency, settle).
+
+    Contradicted is what cannot be: light before the least latency, darkness after the largest, change after both. A
+    display that jitters within what is given is not.
+
+    Raises:
+        ConfigError, SyncError, DeviceError: see `measure`.
+    """
+    longest = LONGEST_REFRESHES * projector.capabilities.refresh_ns
+    with Shots(projector, camera, clock, settings=settings, trigger_mode=trigger_mode, light_delay_ns=longest) as shots:
+        scale = _Scale(shots, _exposure(shots, projector.capabilities.refresh_ns))
+        samples = _burst(shots, scale, 0, longest)
+        shots.show(BLACK)
+    began = Interval(
+        max((s.end_ns for s in samples if s.dark), default=0),
+        min((s.end_ns + 2 * s.bound_ns for s in samples if not s.dark), default=longest),
+    )
+    changing = max((s.start_ns - 2 * s.bound_ns for s in samples if not s.full and not s.dark), default=0)
+    if not _off(given, began, changing):
+        return None
+    latency, settle = measure(projector, camera, clock, settings=settings, trigger_mode=trigger_mode)
+    off = _off(given, latency, latency.low_ns + settle.low_ns)
+    return Disagreement(latency, settle, off) if off else None
+
+
+def _off(given: tuple[Interval, Interval], began: Interval, changing_ns: int) -> int:
+    """By how much a latency that is given is certainly too long, or (negative) too short.
+
+    began: when light began, from the flip. changing_ns: when it was changing still.
+    """
+    latency, settle = given
+    early = latency.low_ns - began.high_ns
+    late = max(began.low_ns - latency.high_ns, changing_ns - latency.high_ns - settle.high_ns)
+    return early if early > 0 else -max(0, late)
 
 
 class _Scale:
@@ -145,6 +203,7 @@ def _sample(scale: _Scale, shot: Shot) -> _Sample:
         shot.exposure.end_ns - bound - flip,
         bool(levels.max() < scale.tolerance),
         bool(levels.min() > 1 - scale.tolerance),
+        bound,
     )
 
 

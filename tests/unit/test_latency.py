@@ -11,6 +11,7 @@ from scanner.clock import VirtualClock
 from scanner.devices import Interval, TriggerMode
 from scanner.errors import ConfigError, SyncError
 from scanner.sequencer import measure_latency
+from scanner.sequencer.latency import Disagreement, disagreement
 
 DEVICE = "quick/board?seed=1"
 
@@ -63,3 +64,42 @@ def test_too_little_contrast_is_refused_in_words() -> None:
 def test_a_static_projector_has_no_latency() -> None:
     with pytest.raises(ConfigError, match="only a display"):
         measured({"kind": "static"})
+
+
+def against(
+    given_ms: tuple[float, float, float, float], projector: dict[str, Any]
+) -> tuple[Disagreement | None, float]:
+    """What is wrong with (latency from, to, settle from, to), and the seconds that it took to say."""
+    clock = VirtualClock()
+    screen, camera = open_projector("simulated", DEVICE, projector, clock), open_camera("simulated", DEVICE, {}, clock)
+    begin = clock.now_ns()
+    latency, settle = (Interval(round(1e6 * low), round(1e6 * high)) for low, high in (given_ms[:2], given_ms[2:]))
+    try:
+        found = disagreement(screen, camera, clock, (latency, settle))
+    finally:
+        camera.close()
+        screen.close()
+    return found, (clock.now_ns() - begin) / 1e9
+
+
+@pytest.mark.parametrize(
+    ("given_ms", "off_ms"),
+    [((100, 100, 0.1, 0.3), 95.5), ((20, 21, 0.1, 0.3), 15.5), ((0, 0, 0, 0), -3.8), ((0, 1, 0, 1), -1.8)],
+)
+def test_a_latency_that_is_not_the_projectors_is_named_with_what_is(
+    given_ms: tuple[float, float, float, float], off_ms: float
+) -> None:
+    found, _ = against(given_ms, {"latency_us": 4200.0, "settle_us": 200.0})
+    assert found is not None
+    assert found.off_ns == pytest.approx(1e6 * off_ms, abs=1.2e6)
+    assert found.latency.low_ns < 4.4e6 < found.latency.high_ns + 1.2e6
+
+
+@pytest.mark.parametrize("projector", [{}, {"scan": "rows", "settle_us": 3000.0}, {"modulation": "pwm"}])
+@pytest.mark.parametrize("given_ms", [(4.0, 4.4, 0, 20), (2.5, 6.0, 0, 20), (0, 60, 0, 20)])
+def test_a_latency_that_may_be_the_projectors_is_believed(
+    projector: dict[str, Any], given_ms: tuple[float, float, float, float]
+) -> None:
+    found, seconds = against(given_ms, projector)
+    assert found is None
+    assert seconds < 0.6
