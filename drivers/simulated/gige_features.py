@@ -277,6 +277,6 @@ def _register(feature: Feature) -> Iterator[str]:
 def _register_body(feature: Feature) -> Iterator[str]:
     yield f"<Address>0x{feature.address:X}</Address>"
     if feature.selected_by:
-        yield f'<pIndex Offset="4">{feature.selected_by}</pIndex>'
+        yield f'<pIndex Offset="4">{feature.selected_by}Register</pIndex>'  # an index is an integer, no enumeration
     yield f"<Length>{feature.length}</Length><AccessMode>{feature.access}</AccessMode>"
     yield f"<pPort>{feature.port}</pPort><Cachable>NoCache</Cachable>"
