@@ -58,7 +58,7 @@ def test_one_that_is_too_short_is_named_where_a_scan_fails_by_it(tmp_path: Path)
     ended, warnings = scanned(tmp_path / "scan", opened, clock)
     assert ended.reason == "sync_lost"
     assert ended.error is not None
-    assert "too short: frames may show another pattern" in ended.error["data"]["hint"]
+    assert "too short: frames may show another pattern" in str(ended.error.data["hint"])
     assert len(warnings) == 1
     opened.close()
 
