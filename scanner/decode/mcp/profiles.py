@@ -1,5 +1,8 @@
 """Profiles across a stripe, averaged along it, and the sums over them that the sub-pixel fit needs.
 
+The sums are the normal equations of the fit in `subpixel`, two unknowns (Lucas and Kanade 1981 for the shift; the slope
+is ours). The slope is shrunk by signal over signal and noise, Wiener's gain (1949), its noise from its scatter along
+the stripe.
 A run of one stripe's peaks is worked on in lanes, its places side by side: rows of `stride` numbers, the first place at
 PAD, and what lies beyond a run's ends is nothing. What the sums mean stands in `subpixel`.
 """
@@ -133,7 +136,7 @@ def _members(p: int, count: int, half: int) -> int:
 
 @kernel
 def slopes(sums: Array, used: Array, count: int, stride: int, kappa: Array, worth: Array, slope: Array) -> None:
-    """The slope of brightness about each place, shrunk by its own significance.
+    """The slope of brightness about each place, shrunk by its own significance (Wiener 1949).
 
     Args:
         sums, used, count, stride: of `add_up`.

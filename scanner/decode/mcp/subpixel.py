@@ -5,6 +5,10 @@ part about the first guess. The odd part is a shift (the even part's own derivat
 or a clipped top need no model: where the top is flat only the flanks speak) plus a slope of brightness; the slope is
 smoothed along the stripe and taken off only as far as it is significant. What stretch of the surface adds to the odd
 part follows from the distances to the neighbouring stripes.
+Casey 2011, sec. 4.1, takes the brightest pixel. A shift by least squares on the signal's own derivative is Lucas and
+Kanade's (1981), here with the profile's mirror image for the second signal; that edges of brightness and of depth move
+such a peak, and which way, is Curless and Levoy's (1995). The slope beside the shift, and how both are kept apart, is
+ours.
 Such a figure averages some 28 x 0.8 pitch pixels: it is no more accurate than its neighbours are alike.
 """
 

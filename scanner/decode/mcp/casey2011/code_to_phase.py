@@ -25,7 +25,7 @@ class CodeToPhase:
     warning: str = ""
 
     def rows(self, index: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Projector rows of stripe indices, minima (k + 0.5) and mid-levels (k +- 0.25) included, same shape."""
+        """Projector rows (sec. 3.7) of stripe indices, minima (k + 0.5) and mid-levels (k +- 0.25) too, same shape."""
         return (np.float64(self.slope) * index + self.intercept).astype(np.float32)
 
 

@@ -131,7 +131,7 @@ class _What:
 
 
 def _decode(upright: NDArray[Any], what: _What, show: Shown) -> Decoded:
-    """The stages in order, stripes horizontal and the first on top."""
+    """The stages in order (fig. 4.1), stripes horizontal and the first on top."""
     model, phase = what.model, what.phase
     clock = Stages()
     show("input", upright)
@@ -174,7 +174,10 @@ def _decode(upright: NDArray[Any], what: _What, show: Shown) -> Decoded:
 
 
 def _upside_down(image: NDArray[Any], what: _What, observer: Observer | None) -> Decoded | None:
-    """The maps if the projector or the camera hangs upside down, so that the stripes' order is reversed; else None."""
+    """The maps if the projector or the camera hangs upside down, so that the stripes' order is reversed; else None.
+
+    Ours: the dissertation's rig stands upright.
+    """
     try:
         decoded = _decode(np.ascontiguousarray(image[::-1]), what, Shown(observer, "image upside down"))
     except DecodeError:
@@ -188,7 +191,7 @@ def _upside_down(image: NDArray[Any], what: _What, observer: Observer | None) ->
 
 
 def _refuse_turned(image: NDArray[Any], what: _What) -> None:
-    """Raise DecodeError if the pattern is there, codes and all, once the image is turned."""
+    """Raise DecodeError if the pattern is there, codes and all, once the image is turned. Ours, as in `refusals`."""
     turned = np.ascontiguousarray(image.T)
     for way_up in (turned, np.ascontiguousarray(turned[::-1])):
         try:

@@ -19,8 +19,8 @@ Labels = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """Places with a name, one row each: x, y px (whole pixels), index (k + 0.5: minimum after stripe k, 2x; k +- 0.25:
-    mid-level beside its peak, 4x), confidence."""
+    """Places with a name (sec. 2.1), one row each: x, y px (whole pixels), index (k + 0.5: minimum after stripe k, 2x;
+    k +- 0.25: mid-level beside its peak, 4x), confidence."""
 
     x: NDArray[np.int32]
     y: NDArray[np.int32]

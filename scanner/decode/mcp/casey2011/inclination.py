@@ -24,7 +24,7 @@ LEAST_SHARE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """A part of the image that is decoded as one.
+    """A part of the image that is decoded as one (sec. 4.2, eq. 5.11).
 
     name: "negligible", "positive" or "negative". mask: (H, W) uint8. slope: mean slope of its stripes, px per px.
     """

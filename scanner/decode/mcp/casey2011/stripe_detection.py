@@ -48,7 +48,7 @@ class Peaks:
     column: NDArray[np.int32]
 
     def image(self, shape: tuple[int, int]) -> Binary:
-        """The stripe image: (H, W) uint8, 1 on peaks."""
+        """The stripe image (sec. 4.1): (H, W) uint8, 1 on peaks."""
         marked = np.zeros(shape, np.uint8)
         marked[self.y, self.column] = 1
         return marked
