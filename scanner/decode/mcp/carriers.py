@@ -1,10 +1,12 @@
 """Brightness along each chain, and the carriers found in it.
 
 The projected carriers are the prior: all of them are magnified alike, so one number, camera pixels per projector
-pixel along the stripes, places them all (where the dissertation searches each by analysis-by-synthesis, 4.3, and
+pixel along the stripes, places them all (where Casey 2011, sec. 4.3, searches each by analysis-by-synthesis, and
 takes one band's lobes for two carriers). That number drifts over the image, by some per cent with the projector above
 the camera and by a tenth to either side with it beside: spectra are taken in tiles, and the drift is searched too.
 `magnification` follows it closer.
+Spectra are means over short windowed pieces (Welch 1967); where pieces are too short for spectra, the carriers are
+fitted to them with the amplitudes eliminated (variable projection, Golub and Pereyra 1973).
 """
 
 from __future__ import annotations
