@@ -12,8 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers import ioctl
 from drivers.registry import open_camera, open_projector
-from drivers.v4l2 import node
+from drivers.v4l2 import camera_driver, driver, node
+from drivers.v4l2 import videodev2 as v
 from drivers.v4l2.controls import EXPOSURE_ABSOLUTE, Control, control_name
 from drivers.v4l2.exposure import EXPOSURE_UNIT_NS, ExposureControl, Stamping
 from drivers.v4l2.formats import CAPTURE_FORMATS, OUTPUT_FORMATS, FrameFormat, pack
@@ -215,6 +217,37 @@ def test_a_name_of_by_id_is_its_link(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     assert node.find("video0", "camera") == str(tmp_path / "video0")
     with pytest.raises(DeviceError, match="no V4L2 device"):
         open_camera("v4l2", "video0", {}, VirtualClock())
+
+
+@pytest.mark.parametrize(
+    ("kernel_driver", "parameter", "said"),
+    [
+        ("uvcvideo", "0", "of arrival, by uvcvideo; modprobe option: options uvcvideo hwtimestamps=1"),
+        ("uvcvideo", "1", "of the camera's clock, by uvcvideo"),
+        ("uvcvideo", None, None),
+        ("vivid", "0", None),
+    ],
+)
+def test_of_a_uvc_camera_it_is_told_what_its_stamps_are(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kernel_driver: str, parameter: str | None, said: str | None
+) -> None:
+    """By what the node calls itself. Whatever that is, stamps are estimates until their delay was measured: above."""
+
+    def answer(_: ioctl.Node, request: int, argument: Any) -> int:
+        assert request == v.QUERYCAP
+        argument.driver, argument.card = kernel_driver.encode(), b"Camera"
+        argument.capabilities = v.CAP_VIDEO_CAPTURE | v.CAP_STREAMING
+        return 0
+
+    (tmp_path / "video0").touch()
+    monkeypatch.setattr(node, "DEVICES", tmp_path)
+    monkeypatch.setattr(ioctl.Node, "call", answer)
+    monkeypatch.setattr(driver, "UVC_STAMPS", tmp_path / "hwtimestamps")
+    if parameter is not None:
+        (tmp_path / "hwtimestamps").write_text(f"{parameter}\n")
+    (found,) = camera_driver.discover()
+    assert found.details["kernel driver"] == kernel_driver
+    assert found.details.get("stamps") == said
 
 
 @pytest.mark.parametrize(
