@@ -36,7 +36,7 @@ from scanner.decode import decoder_for
 from scanner.devices import CameraSettings, TriggerMode
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
 from scanner.patterns.sequence import Precorrection
-from scanner.ripple_correction import without_ripple
+from scanner.ripple_correction import widen_by_ripple, without_ripple
 from scanner.scan import build_scan
 
 RIGHT_GAMMA = 2.3
@@ -106,6 +106,7 @@ def take(rig, kind, pattern, seed):
     camera.close()
     projector.close()
     scan = widen_at_edges(build_scan(decoded, calibration), calibration.phase_axis)
+    scan = widen_by_ripple(scan, sequence, calibration.phase_axis)
     return Taken(scan, truth, decoded, calibration, sequence, camera_format, frames)
 
 

@@ -31,7 +31,7 @@ from scanner.errors import CalibrationError, DecodeError
 from scanner.filter_settings import FilterSettings
 from scanner.geometry import Calibration, load_calibration
 from scanner.patterns import GrayPattern, GrayPmpPattern, McpPattern, PatternSequence, PmpPattern
-from scanner.ripple_correction import without_ripple
+from scanner.ripple_correction import widen_by_ripple, without_ripple
 from scanner.scale_check import require_codes_within, require_geometry
 from scanner.scan import Map, Scan, build_scan
 from scanner.sequencer import CaptureCheck, check_capture
@@ -161,14 +161,16 @@ class Reconstruction:
                 checking.result()  # frames out of step say more than what comes of them
                 raise
             check = checking.result()
+        phase_axis = "y" if self._calibration is None else self._calibration.phase_axis
         if isinstance(self._header.sequence.pattern, PmpPattern | GrayPmpPattern):
             with self._timed("widen sigmas"):
-                scan = widen_at_edges(scan, "y" if self._calibration is None else self._calibration.phase_axis)
+                scan = widen_at_edges(scan, phase_axis)
         scan = scan.with_report(
             sync=check.as_dict(),
             capture=self.capture_report(capture),
             uncertainty=self._budget(scan, check.mixed_share),
         )
+        scan = widen_by_ripple(scan, self._header.sequence, phase_axis)
         with self._timed("drift and marks"):
             scan = watched(scan, self._calibration, self._header)
         if self._options.compare_truth:

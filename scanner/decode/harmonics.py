@@ -3,8 +3,8 @@
 A response that is no line (gamma, a projector's picture modes) gives every fringe overtones whose phases follow its own
 (Guo, He, Zhang 2004; Pan, Huang, Chiang 2006). With N shifts those of order 2 to N / 2 stand apart from the fringe, and
 would be taken for noise: they are measured here, and what they explain of residuals can be taken off. Those of order
-N - 1 and N + 1 cannot be told from the fringe and shift it N times a period: they are measured by how the frequencies
-of a scan contradict one another N times a period. Nothing here corrects a pixel.
+N - 1 and N + 1 cannot be told from the fringe and shift it N times a period: `scanner.decode.ripples` finds those.
+Nothing here corrects a pixel.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode.pmp_frames import AxisFrames
+from scanner.decode.ripples import RippleFit
 from scanner.decode.spectra import (
     AA,
     AB,
@@ -34,10 +35,6 @@ from scanner.decode.spectra import (
     SUMS,
     sum_spectra,
 )
-from scanner.decode.unwrapping import Ladder
-
-FEWEST_SHIFTS_UNHARMED = 6
-"""From these on, overtones of a response shift no fringe by much: the fifth is the first that would."""
 
 MOST_SHARE = 0.45
 """Of an overtone in its fringe: gamma 3 gives .4. And each order is lower than the one before, from LEAST_SHARE on."""
@@ -206,65 +203,6 @@ def _ratio(sums: NDArray[np.float64], folded: bool) -> complex:
 def _left(sums: NDArray[np.float64], ratio: complex, folded: bool) -> complex:
     meant = ratio * complex(sums[MEANT_REAL], sums[MEANT_IMAGINARY])
     return complex(sums[SEEN_REAL], sums[SEEN_IMAGINARY]) - (meant.real if folded else meant)
-
-
-@dataclass(frozen=True)
-class RippleFit:
-    """Overtones that pass for a set's fringe: its error is cosine_px cos(N phase) + sine_px sin(N phase).
-
-    share: of the fringe's height. sigma_px: 1-sigma of either coefficient, projector px.
-    """
-
-    share: float
-    cosine_px: float
-    sine_px: float
-    sigma_px: float
-
-    @property
-    def rms_px(self) -> float:
-        """Over all phases."""
-        return float(np.hypot(self.cosine_px, self.sine_px) / np.sqrt(2))
-
-
-def ripples(
-    ladder: Ladder,
-    remainders: Sequence[NDArray[np.float64]],
-    phases: NDArray[np.float32],
-    shifts: Sequence[int],
-    periods_px: Sequence[float],
-) -> list[RippleFit | None]:
-    """By set, what of it repeats N times a period in how the frequencies contradict one another.
-
-    Args:
-        remainders: (n,) of each step of the ladder, cycles. phases: (K, n) cycles. periods_px: projector px a cycle.
-
-    Returns:
-        None for a set of many shifts, one that no other contradicts, and where there are too few pixels.
-    """
-    found: list[RippleFit | None] = [None] * len(shifts)
-    harmed = [k for k, n in enumerate(shifts) if 3 <= n < FEWEST_SHIFTS_UNHARMED]
-    for remainder, errors in zip(remainders, ladder.errors, strict=True):
-        members = [k for k in harmed if errors[k] != 0]
-        # Far ones are of another order, and tell nothing of a ripple.
-        near = np.abs(remainder - np.median(remainder)) < 0.3 if remainder.size else np.zeros(0, np.bool_)
-        count = int(np.count_nonzero(near))
-        if not members or count < LEAST_PIXELS:
-            continue
-        columns = [np.ones(count)]
-        for k in members:
-            turns = 2 * np.pi * shifts[k] * phases[k][near].astype(np.float64)
-            columns += [np.cos(turns), np.sin(turns)]
-        design = np.stack(columns, axis=1)
-        solved = np.linalg.lstsq(design, remainder[near], rcond=None)[0]
-        left = float(np.std(remainder[near] - design @ solved))
-        for k, (cosine, sine) in zip(members, solved[1:].reshape(-1, 2), strict=True):
-            # A remainder is the sum of the sets' errors, each times its weight.
-            px = periods_px[k] / float(errors[k])
-            share = float(2 * np.pi * np.hypot(cosine, sine) / abs(errors[k]))
-            found[k] = RippleFit(
-                share, float(cosine) * px, float(sine) * px, left * float(np.sqrt(2 / count)) * abs(px)
-            )
-    return found
 
 
 def named_ripple(harmonics: SetHarmonics, ripple: RippleFit | None) -> SetHarmonics:

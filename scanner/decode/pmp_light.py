@@ -16,18 +16,17 @@ from numpy.typing import NDArray
 from scanner.decode.agreement import remainders_of
 from scanner.decode.flicker import Flicker, flicker
 from scanner.decode.harmonics import (
-    FEWEST_SHIFTS_UNHARMED,
     SetHarmonics,
     SetSpectrum,
     explained_by,
     named_ripple,
-    ripples,
     spectra_of,
     told_of,
 )
 from scanner.decode.noise import NoiseModel
 from scanner.decode.pmp_frames import AxisFrames
 from scanner.decode.pmp_sample import PRIOR_FREEDOM, Sample, take_fine_sample
+from scanner.decode.ripples import FEWEST_SHIFTS_UNHARMED, ripples
 from scanner.decode.unwrapping import Ladder
 
 THINNED = 8
@@ -131,10 +130,11 @@ def judge_ripple(
     if all(s.shifts >= FEWEST_SHIFTS_UNHARMED for s in light.harmonics):
         return light
     fine = replace(take_fine_sample(frames, pixels, sample.max_value, clip), prior=sample.prior)
-    phases = fine.judged(noise, least, sigmas).phases
-    shifts = [s.shifts for s in light.harmonics]
-    periods = [along / s.frequency for s in light.harmonics]
-    found = ripples(ladder, remainders_of(ladder, phases, centre), phases, shifts, periods)
+    good = fine.good(noise, least, sigmas)
+    phases = fine.phases[:, good]
+    heights = np.median(fine.modulations[:, good], axis=1) if good.any() else np.zeros(len(phases), np.float32)
+    shifts, frequencies = [s.shifts for s in light.harmonics], [s.frequency for s in light.harmonics]
+    found = ripples(ladder, remainders_of(ladder, phases, centre), phases, heights, shifts, frequencies, along)
     return replace(light, harmonics=tuple(named_ripple(s, r) for s, r in zip(light.harmonics, found, strict=True)))
 
 

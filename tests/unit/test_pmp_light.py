@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 from scanner.decode import decoder_for
+from scanner.decode.agreement import remainders_of
 from scanner.decode.harmonics import height_weights, spectra_of
 from scanner.decode.pmp_frames import axis_frames
+from scanner.decode.ripples import ripples
+from scanner.decode.unwrapping import plan_ladder
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
-from scanner.ripple_correction import without_ripple
+from scanner.ripple_correction import widen_by_ripple, without_ripple
+from scanner.scan import build_scan
 
 PROJECTOR = ProjectorSize(320, 240)
 CAMERA = CameraFormat(240, 160)
@@ -178,3 +182,44 @@ def test_a_ripple_can_be_taken_off(exponent):
     assert told["corrected"]
     assert told["ripple_px"] < 0.3 * of_set(found)["ripple_px"]
     np.testing.assert_array_equal(np.isnan(straight.rows), np.isnan(found.rows))
+
+
+@pytest.mark.parametrize(("exponent", "asked"), [(1.0, False), (1.06, False), (1.06, True)])
+def test_sigmas_cover_a_ripple_that_was_not_taken_off(exponent, asked):
+    """The finest set's ripple is half its noise and more: told by the coarser set, whose error weighs three times."""
+    pattern = PmpPattern(("y",), (1.0, 8.0, 24.0), (3, 3, 3))
+    sequence = PatternSequence(PROJECTOR, pattern)
+    found = decoded(pattern, shown(pattern, exponent, noise=1.2))
+    found = without_ripple(found, sequence) if asked else found
+    plain = build_scan(found, None)
+    wide = widen_by_ripple(plain, sequence, "y")
+    off = np.abs(wide.rows - rows_seen())[10:-10]
+    inside = [100 * np.mean(off < k * wide.sigma_rows[10:-10]) for k in (1, 2)]
+    assert 64 < inside[0] < 72
+    assert 93 < inside[1] < 97
+    assert wide.report["sigma_rows_px"]["median"] == pytest.approx(np.nanmedian(wide.sigma_rows), rel=0.01)
+    if exponent > 1 and not asked:
+        assert np.mean(off < plain.sigma_rows[10:-10]) < 0.62
+        assert of_set(found)["ripple"]["sigma_px"] < 0.15 * of_set(found)["ripple_px"]
+    else:
+        np.testing.assert_allclose(wide.sigma_rows, plain.sigma_rows, rtol=0.03)
+
+
+def test_one_response_ripples_all_sets_alike_but_for_blur():
+    """Phases with a known ripple, blurred in the finest set: the coarse sets tell it, and heights the blur."""
+    random, along, ripple = np.random.default_rng(5), 240, 0.004
+    ladder = plan_ladder((1.0, 8.0, 24.0), [2 / 3] * 3)
+    place, heights = random.random(4000), np.array([60, 60, 54], np.float32)
+    left = (heights / 60) ** 3
+    clean = place * np.array([[1.0], [8.0], [24.0]])
+    seen = clean + ripple * left[:, None] * np.cos(6 * np.pi * clean) + random.normal(0, 0.003, clean.shape)
+    seen = (seen % 1).astype(np.float32)
+    fits = ripples(ladder, remainders_of(ladder, seen, 0.5), seen, heights, (3, 3, 3), (1, 8, 24), along)
+    for frequency, share, fit in zip((1, 8, 24), left, fits, strict=True):
+        assert fit.cosine_px * frequency / along == pytest.approx(ripple * share, abs=0.0003)
+        assert abs(fit.sine_px) * frequency / along < 0.0003
+        assert fit.sigma_px * frequency / along < 0.0003
+    many = ripples(ladder, remainders_of(ladder, seen, 0.5), seen, heights, (3, 8, 8), (1, 8, 24), along)
+    assert [fit is None for fit in many] == [False, True, True]
+    few = seen[:, :50]
+    assert ripples(ladder, remainders_of(ladder, few, 0.5), few, heights, (3, 3, 3), (1, 8, 24), along) == [None] * 3
