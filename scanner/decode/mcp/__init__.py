@@ -21,7 +21,7 @@ module; it is not this one.
 
 from __future__ import annotations
 
-from scanner.decode.mcp import carriers, tracks
+from scanner.decode.mcp import carriers, local_field, tracks
 from scanner.decode.mcp.decoder import McpDecoder, decode_image
 from scanner.patterns import CameraFormat, McpPattern, ProjectorSize
 
@@ -38,4 +38,5 @@ def warm_up() -> None:
         frame = (10 + light * (0.8 * camera.max_value)).astype(camera.dtype)
         decode_image(frame, pattern, projector, camera)
     carriers.warm_up()
+    local_field.warm_up()
     tracks.warm_up()

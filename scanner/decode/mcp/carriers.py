@@ -31,10 +31,11 @@ SCALE_RANGE = 2.2
 """The magnification along the stripes lies within this factor of the one across them, known from the pitch: a surface
 seen at 60 degrees, or projector pixels twice as wide as high."""
 
-DRIFT_Y = np.arange(-0.18, 0.181, 0.02)
-DRIFT_X = np.arange(-0.15, 0.151, 0.03)
-"""Drifts searched, from the image's middle to its border, natural logarithms: across the stripes (a projector at 15
-degrees to the camera drifts by .1 over 20 degrees of view) and along them."""
+DRIFTS = np.arange(-0.3, 0.301, 0.06)
+FINER_DRIFTS = np.arange(-0.04, 0.041, 0.02)
+"""Drifts searched, from the image's middle to its border, natural logarithms, across the stripes and along them; then
+about the best of these. A projector at 15 degrees to the camera drifts by .1 over 20 degrees of view across the
+stripes; one that stands diagonally, before a lens of 60 degrees and a surface tilted by 30, by .2 along them."""
 
 TILES_Y, TILES_X = 6, 4
 """Tiles of the search: within one the drift must not reach the distance of two carriers, a tenth."""
@@ -162,6 +163,8 @@ class CarrierSearch:
     drift_x: float
     drift_y: float
     contrast: tuple[float, ...]
+    aspect: float = 1.0
+    """by which the projector's pixels were taken to be larger along the stripes than across, see `locate.ASPECTS`"""
 
     def relative(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float64]:
         """Magnification over `scale` at places -1 .. 1 across the image."""
@@ -253,16 +256,19 @@ def _align(
     doubt = 4 * weights.sum() * np.log(scales / around) ** 2
     best = (-np.inf, 0, 0.0, 0.0)
     each = np.empty((len(scales), logs.shape[2]))
-    for drift_y in DRIFT_Y:
-        for drift_x in DRIFT_X:
-            _shifted_sum(score, np.rint((at[:, 0] * drift_x + at[:, 1] * drift_y) / LOG_STEP).astype(np.int32), each)
-            # A tile's few stripes may lack a carrier, the image lacks none: another set's lines fit some of ours only.
-            total = each.sum(axis=1) + each.shape[1] * each.min(axis=1)
-            # Without need no drift: a hundredth of the score for each tenth.
-            total = total - doubt - 0.1 * (abs(drift_x) + abs(drift_y)) * np.abs(total)
-            q = int(np.argmax(total))
-            if total[q] > best[0]:
-                best = (float(total[q]), q, float(drift_x), float(drift_y))
+    for steps in (DRIFTS, FINER_DRIFTS):
+        _, _, middle_x, middle_y = best
+        for drift_y in middle_y + steps:
+            for drift_x in middle_x + steps:
+                shift = np.rint((at[:, 0] * drift_x + at[:, 1] * drift_y) / LOG_STEP).astype(np.int32)
+                _shifted_sum(score, shift, each)
+                # A tile's few stripes may lack a carrier, the image none: another set's lines fit some of ours only.
+                total = each.sum(axis=1) + each.shape[1] * each.min(axis=1)
+                # Without need no drift: a hundredth of the score for each tenth.
+                total = total - doubt - 0.1 * (abs(drift_x) + abs(drift_y)) * np.abs(total)
+                q = int(np.argmax(total))
+                if total[q] > best[0]:
+                    best = (float(total[q]), q, float(drift_x), float(drift_y))
     _, q, drift_x, drift_y = best
     own = np.clip(q + np.rint((at[:, 0] * drift_x + at[:, 1] * drift_y) / LOG_STEP).astype(int), 0, len(scales) - 1)
     seen = np.average(logs[np.arange(len(at)), own], axis=0, weights=weights)

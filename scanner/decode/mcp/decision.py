@@ -65,11 +65,19 @@ def decide(found: Found, model: PatternModel, clock: Stages) -> Decision:
         model: the pattern's tables.
         clock: takes the stages' times.
     """
-    peaks, chains, tracks, signals, search = found.parts()
+    _, _, tracks, signals, search = found.parts()
     size = magnification.window_px(model, search.scale)
     shape = (found.reduced.shape[1], found.reduced.shape[0] * stripes.STEP)
     with clock.stage("field"):
-        scale_field = magnification.fit_field(signals.light, tracks, model, search, size, shape)
+        fields = magnification.fit_fields(signals.light, tracks, model, search, size, shape)
+    trials = [_decide_by(field, size, found, model, clock) for field in fields]
+    # A field that is not the surface's contradicts itself from peak to peak: fewer are sure of their stripe.
+    return max(trials, key=lambda trial: (trial.agreement.holds, np.count_nonzero(trial.label >= 0)))
+
+
+def _decide_by(scale_field: Array, size: int, found: Found, model: PatternModel, clock: Stages) -> Decision:
+    """Tell the stripes apart by one field of magnifications, in windows of `size` samples."""
+    peaks, chains, tracks, signals, search = found.parts()
     with clock.stage("emissions"):
         seen = emissions.measure(signals.light, tracks, scale_field, model, search.scale, size)
     sites = linking.sites_of(peaks, tracks.links)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.decode.mcp.ranks import median
 from scanner.decode.mcp.stripes import Peaks
 from scanner.kernel import kernel
 
@@ -22,6 +23,12 @@ Ints = NDArray[np.int32]
 
 BEND = 0.05
 """Distance of a peak from its chain's line, in pitches to a column, that ends the chain."""
+
+REACH = 0.3
+"""Most a stripe moves from one column to the next, in pitches: two stripes are 1 apart."""
+
+STARTS = 2.5
+"""Pitches up or down within which a chain's neighbour tells the way it sets out: further off is another surface."""
 
 
 LEAST_HEIGHT = 0.1
@@ -48,12 +55,41 @@ class Chains:
 def link(peaks: Peaks, pitch: float) -> Chains:
     """Chain the peaks of neighbouring columns: mutual nearest, on a smooth line, of like height.
 
-    Limits in shares of the pitch: 0.3 between columns (two stripes are 1 apart), 0.12 off the line so far
-    (0.5 is the next valley; the profile's flank must stay in the fit window).
+    Limits are REACH between columns and BEND off the line so far (0.5 is the next valley; the profile's flank must stay
+    in the fit window). A chain sets out the way its neighbours in the column go, or all do: a projector that is rolled
+    against the camera inclines stripes by more than BEND.
     """
     column = np.repeat(np.arange(len(peaks.start) - 1, dtype=np.int32), np.diff(peaks.start))
-    order, start = _link(peaks.start, peaks.y, peaks.height, np.float32(0.3 * pitch), np.float32(BEND * pitch))
+    reach, bend = np.float32(REACH * pitch), np.float32(BEND * pitch)
+    order, start = _link(
+        peaks.start, peaks.y, peaks.height, reach, bend, inclination(peaks, pitch), np.float32(STARTS * pitch)
+    )
     return Chains(order, start, column)
+
+
+def inclination(peaks: Peaks, pitch: float) -> np.float32:
+    """How far stripes move from one column to the next, px: the median over nearest peaks of neighbouring columns.
+
+    Half the columns' stripes may be noise's or an edge's, and go anywhere; beyond REACH nobody can say which is next.
+    """
+    steps = np.empty(len(peaks), np.float32)
+    count = _steps(peaks.start, peaks.y, np.float32(REACH * pitch), steps)
+    return np.float32(median(steps[:count])) if count else np.float32(0)
+
+
+@kernel
+def _steps(start: Ints, y: Array, reach: np.float32, steps: Array) -> int:
+    n = 0
+    for b in range(0, len(start) - 2, 2):
+        j = start[b + 1]
+        for i in range(start[b], start[b + 1]):
+            while j < start[b + 2] and y[j] < y[i] - reach:
+                j += 1
+            k = _nearest(y, j, min(j + 3, start[b + 2]), y[i])
+            if k >= 0 and abs(y[k] - y[i]) <= reach:
+                steps[n] = y[k] - y[i]
+                n += 1
+    return n
 
 
 @kernel
@@ -67,7 +103,38 @@ def _nearest(y: Array, first: int, last: int, target: np.float32) -> int:
 
 
 @kernel
-def _link(start: Ints, y: Array, height: Array, reach: np.float32, bend: np.float32) -> tuple[Ints, Ints]:
+def _set_out(first: int, last: int, y: Array, before: Ints, slope: Array, usual: np.float32, near: np.float32) -> None:
+    """Slopes of a column's peaks that have none yet: the nearest one's that has, within `near`, else the usual one."""
+    for i in range(first, last):
+        if before[i] >= 0:
+            continue
+        slope[i] = usual
+        distance = near
+        for k in range(i - 1, first - 1, -1):
+            if y[i] - y[k] >= distance:
+                break
+            if before[k] >= 0:
+                slope[i] = slope[k]
+                distance = y[i] - y[k]
+                break
+        for k in range(i + 1, last):
+            if y[k] - y[i] >= distance:
+                break
+            if before[k] >= 0:
+                slope[i] = slope[k]
+                break
+
+
+@kernel
+def _link(
+    start: Ints,
+    y: Array,
+    height: Array,
+    reach: np.float32,
+    bend: np.float32,
+    usual: np.float32,
+    near: np.float32,
+) -> tuple[Ints, Ints]:
     count = len(y)
     after = np.full(count, -1, np.int32)
     before = np.full(count, -1, np.int32)
@@ -75,6 +142,7 @@ def _link(start: Ints, y: Array, height: Array, reach: np.float32, bend: np.floa
     least = np.float32(LEAST_HEIGHT)
     for b in range(len(start) - 2):
         j = start[b + 1]
+        _set_out(start[b], start[b + 1], y, before, slope, usual, near)
         for i in range(start[b], start[b + 1]):
             target = y[i] + slope[i]
             while j < start[b + 2] and y[j] < target - reach:

@@ -33,6 +33,11 @@ PLAIN_CONTRAST = 1.5
 PITCHES_TRIED = 3
 """Candidates for the pitch: the stripes', and two that texture may offer."""
 
+ASPECTS = (0.5, 2.0)
+"""Along the stripes over across them, of projector pixels that are not square: mirrors that stand on their corners make
+columns twice as wide as rows are high. `carriers.SCALE_RANGE` about a pixel twice as wide leaves nothing for a surface
+that is tilted too. Tried where square pixels bring no carriers to light."""
+
 EVEN = 1.25
 """Ratio of the peaks' median distance to the pitch, or the inverse, up to which they go together: keystone and texture
 take less, and a pattern taken for half or twice as fine is off by two."""
@@ -80,6 +85,22 @@ class Found:
     tracks: Tracks | None = None
     signals: carriers.Signals | None = None
     search: carriers.CarrierSearch | None = None
+
+    @property
+    def plain(self) -> bool:
+        """Nothing else need be tried: stripes as far apart as the pitch says, and all of the carriers on them."""
+        each = (0.0,) if self.search is None else self.search.contrast
+        return self.even and self.contrast >= PLAIN_CONTRAST and min(each) >= 1
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """By which trials are compared: by all carriers, none for more than a factor of three, and the weakest again.
+
+        Two strong ones among four are another set's, or texture's.
+        """
+        each = (0.1,) if self.search is None else self.search.contrast
+        logs = np.log(np.clip(each, 0.1, 3.0))
+        return self.even, float(logs.mean() + logs.min())
 
     def parts(
         self,
@@ -144,23 +165,29 @@ def locate(image: Image, model: PatternModel, camera: CameraFormat, clock: Stage
         found.hint = "check that the projector shows the pattern, its focus, and the exposure"
         return found
     if known is not None:
-        return _search(
-            replace(found, pitch=known.pitch, match=known.match, search=known.search), image, model, camera, clock
-        )
+        known_here = replace(found, pitch=known.pitch, match=known.match, search=known.search)
+        return _search(known_here, image, model, camera, clock, known.search.aspect)
     with clock.stage("pitch"):
         candidates = stripes.estimate_pitch(found.reduced, model, PITCHES_TRIED)
     best: Found | None = None
     for pitch, match in candidates:
         trial = _search(replace(found, pitch=pitch, match=match), image, model, camera, clock)
-        if trial.even and trial.contrast >= PLAIN_CONTRAST:
+        if trial.plain:
             return trial
-        if best is None or (trial.even, trial.contrast) > (best.even, best.contrast):
-            best = trial
+        best = trial if best is None or trial.rank > best.rank else best
+    for aspect in ASPECTS:
+        pitch, match = candidates[0]
+        trial = _search(replace(found, pitch=pitch, match=match), image, model, camera, clock, aspect)
+        if trial.plain:
+            return trial
+        best = trial if best is None or (trial.rank > best.rank and trial.contrast >= PLAIN_CONTRAST) else best
     return best or found
 
 
-def _search(found: Found, image: Image, model: PatternModel, camera: CameraFormat, clock: Stages) -> Found:
-    """Stripes and carriers at one candidate's pitch."""
+def _search(
+    found: Found, image: Image, model: PatternModel, camera: CameraFormat, clock: Stages, aspect: float = 1.0
+) -> Found:
+    """Stripes and carriers at one candidate's pitch, the projector's pixels `aspect` times as wide as high."""
     if found.pitch < stripes.MIN_PITCH_PX:
         found.fault = f"stripes are {found.pitch:.1f} px apart, too fine for this camera"
         found.hint = "project fewer bits, or move the camera closer"
@@ -168,7 +195,7 @@ def _search(found: Found, image: Image, model: PatternModel, camera: CameraForma
     if found.match < MIN_PITCH_MATCH:
         found.fault = f"no stripes of this pattern (spectra agree to {found.match:.2f})"
         return found
-    around = found.pitch / model.pitch
+    around = aspect * found.pitch / model.pitch
     with clock.stage("peaks"):
         longest = around / float(model.carriers.min())
         found.peaks = stripes.find_peaks(found.reduced, found.pitch, longest, found.noise, model.weakest)
@@ -194,8 +221,9 @@ def _search(found: Found, image: Image, model: PatternModel, camera: CameraForma
     if found.search is not None:
         return found
     with clock.stage("carriers"):
-        found.search = carriers.search_carriers(
-            found.signals, found.tracks, model, around, (image.shape[0], image.shape[1])
+        shape = image.shape[0], image.shape[1]
+        found.search = replace(
+            carriers.search_carriers(found.signals, found.tracks, model, around, shape), aspect=aspect
         )
     found.contrast = float(np.exp(np.log(np.maximum(found.search.contrast, 0.1)).mean()))
     if found.contrast < MIN_CONTRAST:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.decode.mcp import local_field
 from scanner.decode.mcp.carriers import CarrierSearch, places
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.ranks import quantiles
@@ -27,6 +28,10 @@ FIELD_RANGE = 0.07
 
 FIELD_STEP = 0.005
 """Steps of the tables of emissions: .05 cycles at the end of a window of 20 periods."""
+
+LEAST_OFF = FIELD_STEP
+"""Half of the windows lie nearer than this to a smooth field that holds (.0044 at most, on reference scenes; .008 and
+more where a rolled projector draws carriers together): what the tables of emissions resolve."""
 
 MOST_WINDOWS = 300
 """Windows that vote: the fit has four unknowns."""
@@ -61,21 +66,75 @@ def fit_field(
     Returns:
         (N,) float32: magnification relative to `search.scale`.
     """
-    x, y = places(tracks, shape)
+    return _fit(light, tracks, model, search, size, shape)[0]
+
+
+def fit_fields(
+    light: Array,
+    tracks: Tracks,
+    model: PatternModel,
+    search: CarrierSearch,
+    size: int,
+    shape: tuple[int, int],
+) -> tuple[Array, ...]:
+    """`fit_field`'s smooth field; and where single windows stay away from it, a second one found place by place.
+
+    Arguments are those of `fit_field`. Which of two is right shows when stripes are decoded: print can feign a field
+    that varies, too.
+    """
+    smooth, off = _fit(light, tracks, model, search, size, shape)
+    if off <= LEAST_OFF:
+        return (smooth,)
+    starts = _windows(tracks, size)
+    cells = local_field.Cells.of(tracks, model.pitch * search.scale, size, shape)
+    own = local_field.found_about(
+        light, starts, tracks, smooth, local_field.Axes(_cycles(model, search.scale), size), cells
+    )
+    return smooth, own
+
+
+def _cycles(model: PatternModel, scale: float) -> tuple[float, ...]:
+    """Carriers in cycles per camera px."""
+    return tuple(float(f) / scale for f in model.carriers)
+
+
+def _windows(tracks: Tracks, size: int) -> Ints:
+    """Where windows of `size` samples begin along the tracks, half of one apart, in places."""
     chains = tracks.chains
-    base = search.relative(x, y) - 1
     hop = max(1, size // (2 * STEP))
     windows = np.maximum((chains.lengths - size // STEP) // hop + 1, 0)
     before = np.repeat(np.cumsum(windows) - windows, windows)
-    starts = np.repeat(chains.start[:-1], windows) + hop * (np.arange(len(before)) - before)
+    return np.asarray(np.repeat(chains.start[:-1], windows) + hop * (np.arange(len(before)) - before), np.int32)
+
+
+def _fit(
+    light: Array,
+    tracks: Tracks,
+    model: PatternModel,
+    search: CarrierSearch,
+    size: int,
+    shape: tuple[int, int],
+) -> tuple[Array, float]:
+    """The smooth field, and how far from it half of the votes lie."""
+    x, y = places(tracks, shape)
+    base = search.relative(x, y) - 1
+    starts = _windows(tracks, size)
     if len(starts) < 8:
-        return np.asarray(1 + base, np.float32)
-    begin = starts.astype(np.int32)[:: max(1, len(starts) // MOST_WINDOWS)]
-    middle = chains.order[begin + size // (2 * STEP)]
+        return np.asarray(1 + base, np.float32), 0.0
+    begin = starts[:: max(1, len(starts) // MOST_WINDOWS)]
+    middle = tracks.chains.order[begin + size // (2 * STEP)]
     value, weight = _votes(light, begin * STEP, base[middle], model, search.scale, size)
     design = np.stack([np.ones(len(x)), x, y, x * y], axis=1)
     more = _robust_fit(design[middle], value - base[middle], weight, design)
-    return np.asarray(1 + base + np.clip(more, -FIELD_RANGE, FIELD_RANGE), np.float32)
+    smooth = base + np.clip(more, -FIELD_RANGE, FIELD_RANGE)
+    return np.asarray(1 + smooth, np.float32), _weighted_median(np.abs(value - smooth[middle]), weight)
+
+
+def _weighted_median(values: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
+    """Of windows that hold carriers; no strong one counts for many."""
+    order = np.argsort(values)
+    total = np.cumsum(np.minimum(weight, quantiles(weight, 0.9)[0])[order])
+    return float(values[order[min(int(np.searchsorted(total, total[-1] / 2)), len(order) - 1)]])
 
 
 def _votes(
