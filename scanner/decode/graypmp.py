@@ -122,7 +122,8 @@ class GrayPmpDecoder:
         return decode_axis(pmp, along, self._camera, frames, maps, PmpThresholds(), self._threads, alone)
 
     def _code(self, light: AxisMaps) -> Decoded:
-        """The code, decoded. Where neither inverses nor white and black were projected, the fringes stand for them."""
+        """The code, decoded. Where neither inverses nor white and black were projected, fringes and coarse bits stand for
+        them."""
         part = PartSequence.of(self._sequence, self._pattern.gray, self._pattern.pmp.fringe_count)
         frames = {p: self._frames[p] for p in part.chosen if p in self._frames}
         for position in (part.white, part.black):
@@ -133,13 +134,29 @@ class GrayPmpDecoder:
                 part.projector, part.pattern, part.total, part.total + 1, part.sentinels, part.bars,
                 part.precorrection, part.chosen, part.total + 2,
             )  # fmt: skip
+            contrast = self._half_contrast(light, [frames[p] for p in part.chosen if p in frames])
             for position, sign in ((part.total - 2, 1), (part.total - 1, -1)):
-                level = np.clip(light.albedo + sign * light.modulation, 0, self._camera.max_value)
+                level = np.clip(light.albedo + sign * contrast, 0, self._camera.max_value)
                 frames[position] = np.rint(level).astype(self._camera.dtype).reshape(self._camera.shape)
         decoder = GrayDecoder(part, self._camera, threads=self._threads)
         for position, frame in frames.items():
             decoder.keep(position, frame)
         return decoder.finish()
+
+    def _half_contrast(self, light: AxisMaps, code: list[NDArray[Any]]) -> NDArray[np.float32]:
+        """(P,) float32: half of what white and black would differ by.
+
+        Fringes show it where they are sharp. Blur takes from fine fringes what it leaves to the coarse bits, and levels
+        that the bits go beyond would pass for noise: how far those lie from the fringes' mean says it without blur. Of
+        the coarse half of an axis's bits one at most is on a border here, which the middle one leaves out.
+        """
+        axes, bits = len(self._pattern.axes), self._pattern.gray.bits
+        if len(code) != axes * bits or bits < 4:
+            return light.modulation
+        coarse = np.stack([frame.reshape(-1) for frame in code[: (bits + 1) // 2]]).astype(np.float32)
+        apart = np.abs(coarse - light.albedo)
+        middle = len(apart) // 2
+        return np.asarray(np.partition(apart, middle, axis=0)[middle], np.float32)
 
     def _decoded(
         self,
