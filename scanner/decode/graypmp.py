@@ -122,8 +122,10 @@ class GrayPmpDecoder:
         return decode_axis(pmp, along, self._camera, frames, maps, PmpThresholds(), self._threads, alone)
 
     def _code(self, light: AxisMaps) -> Decoded:
-        """The code, decoded. Where neither inverses nor white and black were projected, fringes and coarse bits stand for
-        them."""
+        """The code, decoded.
+
+        Where neither inverses nor white and black were projected, fringes and coarse bits stand for them.
+        """
         part = PartSequence.of(self._sequence, self._pattern.gray, self._pattern.pmp.fringe_count)
         frames = {p: self._frames[p] for p in part.chosen if p in self._frames}
         for position in (part.white, part.black):
