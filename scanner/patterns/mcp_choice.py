@@ -17,7 +17,12 @@ from scanner.patterns.description import Axis, ProjectorSize
 from scanner.patterns.mcp import PERMUTED_CODES, McpPattern
 
 BLUR_PX = 0.7
-"""Sigma of the point spread taken for both devices, in their own pixels: a well-focused lens on either"""
+"""Sigma of the point spread taken for both devices, in their own pixels (the longer side of those that are not square):
+a well-focused lens on either"""
+
+SQUARE = 1.2
+"""Ratio of a projector's pixels' sides, as the camera sees them, up to which they count as square: where the axes
+converge by 30 degrees it is 1.15. A lens blurs to all sides alike: of pixels half as wide it takes twice as many."""
 
 LEAST_MODULATION = 0.58
 """Share of the finest carrier's modulation that blur must leave: at a half its code bits drown where light is weak"""
@@ -61,7 +66,7 @@ def choose_mcp(projector: ProjectorSize, axis: Axis, camera_scale: tuple[float, 
     why = {"axis": f"{axis}: the projected axis that moves with depth"}
     along, across = projector.along(axis), projector.along("x" if axis == "y" else "y")
     scale_along, scale_across = (camera_scale[1], camera_scale[0]) if axis == "y" else camera_scale
-    finest = _finest(across, scale_across, why)
+    finest = _finest(across, scale_across, scale_along / scale_across, why)
     bits = _bits(along, scale_along, why)
     problem: DecodeError | None = None
     for fewer in range(bits, FEWEST_BITS - 1, -1):
@@ -91,13 +96,18 @@ def codes_of(bits: int) -> tuple[int, ...]:
     return PERMUTED_CODES if bits == MOST_BITS else tuple(range(1 << bits))
 
 
-def _finest(across: int, scale: float, why: dict[str, str]) -> float:
-    """Cycles of the finest carrier whose modulation survives both blurs: exp(-2 pi^2 s^2 (1 / p^2 + 1 / (p m)^2))."""
+def _finest(across: int, scale: float, longer: float, why: dict[str, str]) -> float:
+    """Cycles of the finest carrier whose modulation survives both blurs: exp(-2 pi^2 s^2 (a^2 / p^2 + 1 / (p m)^2)).
+
+    longer: side of a projector pixel along the axis over its side across; a is this where pixels are not SQUARE.
+    """
     most = -math.log(LEAST_MODULATION) / (2 * math.pi**2 * BLUR_PX**2)
-    period = math.sqrt((1 + 1 / scale**2) / most)
+    wider = longer if longer > SQUARE else 1.0
+    period = math.sqrt((wider**2 + 1 / scale**2) / most)
     why["carriers"] = (
         f"the finest has a period of {period:.1f} projector and {period * scale:.1f} camera pixels: focused lenses "
         f"({BLUR_PX:g} px) leave it {LEAST_MODULATION:.0%} of its modulation"
+        + (f", projector pixels being {wider:.1f} times as long the other way" if wider > 1 else "")
     )
     finest = across / period
     return FINEST if abs(finest / FINEST - 1) < NEAR else finest

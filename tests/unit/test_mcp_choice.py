@@ -48,6 +48,16 @@ def test_stripes_that_the_camera_cannot_tell_apart_become_fewer():
     assert bits == [4, 3, 2]
 
 
+def test_pixels_half_as_wide_as_high_have_twice_the_blur_across():
+    # Mirrors on their corners: rows half as high as columns are wide, carriers along the rows' count.
+    projector, scale = ProjectorSize(912, 1140), 2.0
+    square, choice = (choose_mcp(projector, "x", (along, 1.0)) for along in (1.0, scale))
+    # The same lens: cycles fall as its spread along the carriers, sqrt(2^2 + 1) for sqrt(1 + 1), grows.
+    assert max(choice.pattern.carriers) == pytest.approx(max(square.pattern.carriers) * np.sqrt(2 / 5), rel=0.01)
+    assert "2.0 times as long" in choice.why["carriers"]
+    assert "times as long" not in square.why["carriers"]
+
+
 def test_the_reference_rigs_get_what_the_default_was_found_to_be():
     calibration = rig("casey2011").calibration
     choice = choose_mcp(ProjectorSize(*calibration.projector.size), "y", calibration.camera_scale)
