@@ -5,6 +5,7 @@
 #
 #     setup/rig.sh                      build what is missing, run the tests of tests/rig: drivers first, then the service
 #     setup/rig.sh run CMD ARGS...      run a command in the guest (without systemd)
+#     setup/rig.sh steady CMD ARGS...   the same, where this machine cannot make the guest late: its clock counts instructions
 #     setup/rig.sh boot CMD ARGS...     the same, with systemd as the first process
 #     setup/rig.sh build                build the image only
 #     setup/rig.sh possible             exit 0 if the rig can run here; else say why not
@@ -123,7 +124,7 @@ prepare() {
 
 # boot MODE CMD ARGS...
 boot() {
-    local mode=$1 command status began
+    local mode=$1 command status began processors
     shift
     printf -v command '%q ' "$@"
     command=$(printf 'exec %s' "$command" | base64 -w 0)
@@ -154,9 +155,14 @@ boot() {
 # Nehalem has no AVX, whose masked loads QEMU 7.2 emulates wrongly: they fault where only what is masked out lies on a
 # page that is not there, and NumPy sorts with them. TMPDIR holds the guest's changes to its disk, which snapshot=on
 # throws away. The second display is for pulling out: its driver, unlike vkms, can be unbound while it is in use.
+# Mode steady: each instruction takes the guest 2 ns, whatever it took here, and time in which its one processor has
+# nothing to do passes at once. All its clocks and timers follow. 500 million instructions a second are fewer than one
+# processor of a Raspberry Pi 3 does. What waits for this machine (its disk, the clone) sees time fly meanwhile.
 start_qemu() {
+    processors=(-accel tcg,thread=multi -smp "${RIG_CPUS:-2}")
+    [ "$mode" != steady ] || processors=(-accel tcg,thread=single -icount shift=1,sleep=off -smp 1)
     TMPDIR=$run setpriv --pdeathsig KILL timeout --kill-after=10 "$bound" setpriv --pdeathsig KILL qemu-system-x86_64 \
-        -accel tcg,thread=multi -cpu Nehalem -smp "${RIG_CPUS:-2}" -m 2048 -nodefaults -no-user-config -display none -no-reboot \
+        "${processors[@]}" -cpu Nehalem -m 2048 -nodefaults -no-user-config -display none -no-reboot \
         -kernel "$state/vmlinuz" -initrd "$state/initramfs" \
         -append "console=ttyS0 quiet panic=-1 mitigations=off modprobe.blacklist=virtio-gpu,virtio_gpu rig.mode=$mode rig.share=$clone rig.command=$command" \
         -drive "file=$state/image,format=raw,if=none,id=root,snapshot=on" -device virtio-blk-pci,drive=root \
@@ -174,7 +180,7 @@ start_qemu() {
 # Until QEMU ended; a guest that does not come up in time, or is not done in time, is ended.
 await_guest() {
     local up= patience=${RIG_BOOT:-300}
-    [ "$mode" = fast ] || patience=$((2 * patience))
+    [ "$mode" != systemd ] || patience=$((2 * patience))
     while kill -0 "$child" 2>/dev/null; do
         [ -n "$up" ] || ! grep -qs '^up$' "$run/status" || up=$SECONDS
         if [ -z "$up" ] && [ $((SECONDS - began)) -gt "$patience" ]; then late "the guest's start" "$patience"; fi
@@ -187,11 +193,14 @@ await_guest() {
     case $status in 124 | 137) late "the guest" "$bound" ;; esac
 }
 
-# fast|systemd: the tests that need the guest booted so.
+# fast|steady|systemd: the tests that need the guest booted so.
 phase() {
     local pytest=("$clone/.venv/bin/python" -m pytest -q -p no:cacheprovider --durations=5)
     case $1 in
         fast) say "drivers, against the kernel's devices"; boot fast "${pytest[@]}" tests/rig tests/contract/test_window.py ;;
+        steady) # no bound on single tests: by the guest's clock waiting for the disk may take minutes
+            say "drivers in time, by a clock that counts instructions"
+            boot steady "${pytest[@]}" --timeout=0 tests/rig/test_steady*.py ;;
         systemd) say "the service, under systemd"; boot systemd "${pytest[@]}" tests/rig/test_installed.py ;;
     esac
 }
@@ -201,7 +210,7 @@ tests() {
     sources=$(everything)
     rm -f "$state/passed"
     prepare
-    for name in fast systemd; do
+    for name in fast steady systemd; do
         began=$SECONDS
         phase $name || status=1 # whatever the command in the guest said
         say "this took $((SECONDS - began)) s"
@@ -243,6 +252,7 @@ case ${1:-tests} in
     possible) why=$(obstacle); [ -z "$why" ] || { say "$why"; exit 1; } ;;
     build) preparing=yes; build ;;
     run) shift; prepare; boot fast "$@" ;;
+    steady) shift; prepare; boot steady "$@" ;;
     boot) shift; prepare; boot systemd "$@" ;;
     tests) tests ;;
     if-possible) tests_if_possible ;;
