@@ -2,11 +2,12 @@
 
     python bench/pmp.py [--size 1392x1040] [--bits 8] [--frequencies 1,8,64] [--shifts 8] [--runs 15] [--gray]
 
-For one thread and for as many as there are: ms to decode frames that are all at hand, to all maps (`finish`) and, of
-PMP, to rows and confidence alone (`coordinates`); ms a frame and after the last one where they come one by one; reading
-all frames once, and writing two float32 maps besides; a decode with OpenCV and NumPy; and `fringes` (PyPI, mode
-"fast"), if it is installed. Frames rotate over several stacks, so that none is still in a cache
-from the run before. Medians and least times; a decoder and its maps are made before its time runs, as in a scan.
+For one thread and for as many as there are: ms to decode frames that are all at hand, to all maps (`finish`) and to
+coordinates and confidence alone (`coordinates`); ms a frame and after the last one where they come one by one, and how
+much that is beyond a pass over frames at hand; reading all frames once, and writing two float32 maps besides; a decode
+with OpenCV and NumPy; and `fringes` (PyPI, mode "fast"), if it is installed. Frames rotate over several stacks, so that
+none is still in a cache from the run before. Medians and least times; ratios are medians of ratios of what ran one
+after the other. A decoder and its maps are made before its time runs, as in a scan.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, PmpPatt
 
 PROJECTOR = ProjectorSize(1152, 864)
 STACKS = 4
+OURS_AROUND = 3
+"""Runs of ours to one of another's."""
 
 
 def main():
@@ -54,28 +57,25 @@ def main():
     for threads in sorted({1, threads_to_use()}):
         measure(kind, sequence, camera, stacks, chosen.runs, threads)
     if not chosen.gray:
-        measure_others(sequence, camera, stacks)
+        measure_others(sequence, camera, stacks, chosen.runs)
 
 
 def measure(kind, sequence, camera, stacks, runs, threads):
-    """Print the rows of one number of threads."""
+    """Print the rows of one number of threads. What is compared runs in turns; ratios are medians over them."""
     whole, brief, adding, finishing, floor, reading, decided = [], [], [], [], [], [], []
     for run in range(runs):
         decoder = kind(sequence, camera, threads=threads)
-        frames = stacks[run % STACKS]
         begin = time.perf_counter()
-        for position, frame in enumerate(frames):
-            decoder.keep(position, frame)
+        keep_all(decoder, stacks[run % STACKS])
         found = decoder.finish()
         whole.append(time.perf_counter() - begin)
         decided.append(float(np.mean(found.reason == 0)))
         floor.append(read_and_write(stacks[(run + 2) % STACKS], threads))
+        brief.append(coordinates_time(kind(sequence, camera, threads=threads), stacks[(run + 1) % STACKS]))
         reading.append(read_and_write(stacks[(run + 3) % STACKS], threads, maps=False))
-        if kind is pmp.PmpDecoder:
-            brief.append(coordinates_time(kind(sequence, camera, threads=threads), stacks[(run + 1) % STACKS]))
         decoder = kind(sequence, camera, threads=threads)
         begin = time.perf_counter()
-        for position, frame in enumerate(stacks[(run + 1) % STACKS]):
+        for position, frame in enumerate(stacks[(run + 2) % STACKS]):
             decoder.add(position, frame)
         middle = time.perf_counter()
         decoder.finish()
@@ -85,35 +85,46 @@ def measure(kind, sequence, camera, stacks, runs, threads):
     print(f"{name}, {min(decided):.1%} decided")
     for label, times in (
         ("all frames at hand, all maps", whole),
-        ("rows and confidence", brief),
+        ("coordinates and confidence", brief),
         ("one by one: a frame", adding),
         ("one by one: after the last", finishing),
         ("read once, write two maps", floor),
         ("read once", reading),
     ):
-        if not times:
-            continue
-        to_floor, to_reading = (np.median(times) / np.median(other) for other in (floor, reading))
+        to_floor, to_reading = (median_ratio(times, other) for other in (floor, reading))
         print(
             f"  {label:30s}{1e3 * np.median(times):8.2f} ({1e3 * min(times):.2f})"
             f"   {to_floor:5.2f} x read and write, {to_reading:5.2f} x read"
         )
+    beyond = np.subtract(finishing, whole)
+    print(f"  {'after the last, beyond a pass':30s}{1e3 * np.median(beyond):8.2f} ({1e3 * min(beyond):.2f})")
+
+
+def median_ratio(times, others):
+    """Median of the ratios of what ran one after the other: a neighbour's load that slows both leaves it as it is."""
+    return np.median(np.divide(times, others))
+
+
+def keep_all(decoder, frames):
+    """Give all frames to a decoder where they lie."""
+    for position, frame in enumerate(frames):
+        decoder.keep(position, frame)
 
 
 def coordinates_time(decoder, frames):
-    """Seconds of a decode to rows and confidence."""
+    """Seconds of a decode to coordinates and confidence."""
     begin = time.perf_counter()
-    for position, frame in enumerate(frames):
-        decoder.keep(position, frame)
+    keep_all(decoder, frames)
     decoder.coordinates()
     return time.perf_counter() - begin
 
 
-def measure_others(sequence, camera, stacks):
-    """Print what others need for the same frames; one thread is theirs to choose."""
-    ours = []
-    for run in range(6):
-        ours.append(coordinates_time(pmp.PmpDecoder(sequence, camera), stacks[run % STACKS]))
+def measure_others(sequence, camera, stacks, runs):
+    """Print what others need for the same frames; one thread is theirs to choose.
+
+    Theirs and ours run in turns. Each ratio is that of one run of theirs to the median of the three of ours around it;
+    what is told is their median, and what half of them lie between.
+    """
     others = {"OpenCV and NumPy": lambda frames: plain_decode(sequence.pattern, frames)}
     if importlib.util.find_spec("fringes") is not None:
         others['fringes, mode "fast"'] = decode = decoder_of_fringes(sequence.pattern)
@@ -123,12 +134,19 @@ def measure_others(sequence, camera, stacks):
         print("fringes is not installed: no comparison with it")
     for name, decode in others.items():
         decode(stacks[0])
-        times = []
-        for run in range(3):
-            begin = time.perf_counter()
-            decode(stacks[(run + 1) % STACKS])
-            times.append(time.perf_counter() - begin)
-        print(f"{name:30s}{1e3 * np.median(times):8.1f}   {np.median(times) / np.median(ours):5.1f} x ours")
+        times, ratios = [], []
+        for run in range(runs):
+            around = []
+            for turn in range(OURS_AROUND):
+                if turn == OURS_AROUND // 2:
+                    begin = time.perf_counter()
+                    decode(stacks[run % STACKS])
+                    times.append(time.perf_counter() - begin)
+                decoder = pmp.PmpDecoder(sequence, camera)
+                around.append(coordinates_time(decoder, stacks[(run + turn + 1) % STACKS]))
+            ratios.append(times[-1] / np.median(around))
+        low, middle, high = np.percentile(ratios, (25, 50, 75))
+        print(f"{name:30s}{1e3 * np.median(times):8.1f}   {middle:5.1f} x ours ({low:.1f} to {high:.1f})")
 
 
 def coordinates_of(sequence, camera, frames):
@@ -204,6 +222,8 @@ def read(words):
 
 
 _maps = {}
+_pool = ThreadPoolExecutor()
+"""Threads that are there already, as a decoder's are."""
 
 
 def read_and_write(stack, threads, maps=True):
@@ -219,11 +239,10 @@ def read_and_write(stack, threads, maps=True):
     if threads == 1:
         part(0)
     else:
-        with ThreadPoolExecutor(threads - 1) as pool:
-            others = [pool.submit(part, i) for i in range(1, threads)]
-            part(0)
-            for other in others:
-                other.result()
+        others = [_pool.submit(part, i) for i in range(1, threads)]
+        part(0)
+        for other in others:
+            other.result()
     return time.perf_counter() - begin
 
 

@@ -2,9 +2,9 @@
 
 A pixel sees its neighbourhood through a blur of some pixel's width. Fringes of the brighter side outweigh those of the
 darker, so that the coordinate read is one of a place a little towards the light: by the blur's variance times the
-gradient of log brightness (the first moment of a Gaussian times a slope). That is no noise: it stays
-however often a scan is repeated, but it changes sign from edge to edge. Sigmas are widened by its size; coordinates are
-left as they were read.
+gradient of log brightness (the first moment of a Gaussian times a slope; Burke and Zhong 2017 show the effect). That is
+no noise: it stays however often a scan is repeated, but it changes sign from edge to edge. Sigmas are widened by its
+size; coordinates are left as they were read.
 """
 
 from __future__ import annotations

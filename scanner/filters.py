@@ -2,9 +2,10 @@
 
 A filter takes points (xyz), never measurements: rows and columns stay as decoded. Each counts what it removed.
 The edge filter asks one question of each pair of neighbouring pixels: is the step between their points steeper than a
-surface that can be measured? Two neighbours on one surface differ along the line of sight by at most the pixel's
-footprint x tan(80 degrees), plus their noise. Where they differ by more there is a depth edge, and both pixels may
-have seen both sides of it: both fall. What is left of a flying sheet are specks, which fall by their size.
+surface that can be measured (as May et al. 2009 find jump edges)? Two neighbours on one surface differ along the line
+of sight by at most the pixel's footprint x tan(80 degrees), plus their noise. Where they differ by more there is a
+depth edge, and both pixels may have seen both sides of it: both fall. What is left of a flying sheet are specks, which
+fall by their size.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 Loops over a line of pixels have no branches, touch few arrays and write each result once, so that the compiler can
 prove the arrays apart and use vector instructions: 2 ms against 70 ms for 1392 x 1040 pixels. `numbers` is a tuple for
-that reason. What the figures mean, and what is refused, stands in `scanner.triangulation`.
+that reason. What the figures mean, and what is refused, stands in `scanner.triangulation`; the closed form is that of
+Casey 2011, sec. 3.5, distortion Brown's (1966).
 """
 
 from __future__ import annotations

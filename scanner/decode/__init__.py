@@ -69,6 +69,17 @@ class Decoded:
     """counts, thresholds and figures for report.json, plain data"""
 
 
+@dataclass(frozen=True)
+class Coordinates:
+    """What a scan is triangulated by and no more, (H, W) float32 each: as in `Decoded`."""
+
+    rows: Map | None
+    columns: Map | None
+    confidence: Map
+    warnings: tuple[str, ...]
+    """of frames that are missing or out of step"""
+
+
 class Decoder(Protocol):
     """One scan's decoder."""
 

@@ -3,7 +3,7 @@
 Within a set, what is left of the samples once the fringe and its overtones are taken off has no cause that is common
 to pixels of all phases but the light itself; between sets the mean A would be the same. Lamps on mains, exposures that
 are no whole number of refreshes and automatic gain show so. The part of it that looks like the fringe itself cannot be
-told apart, and shifts all phases of a set together with it.
+told apart, and shifts all phases of a set together with it (van Wingerden, Frankena, Smorenburg 1991).
 """
 
 from __future__ import annotations

@@ -79,6 +79,7 @@ def decode_codes(
     limits: NDArray[np.float32],
     begin: int,
     end: int,
+    brief: bool,
     maps: NDArray[np.float32],
     reason: NDArray[np.uint8],
     counts: NDArray[np.int64],
@@ -95,6 +96,7 @@ def decode_codes(
         noise: [variance at level 0, variance per level, least variance, factor].
         limits: [contrast in levels, contrast in sigmas squared, decisive share of the contrast, decisive sigmas
             squared, wrong-bit probability, cells that open bits may span, largest grey level].
+        brief: write positions, confidence and reason alone.
         maps: (2 A + 3, P + up to LANES) float32 whose rows begin with a cache line; positions, sigmas, confidence,
             albedo, modulation. reason: (P + up to LANES,) uint8. Both are written up to a multiple of LANES.
         counts: (9,) int64, how many pixels have each reason, is added to.
@@ -112,8 +114,8 @@ def decode_codes(
                 # One that is not there has address 0, and asking for it does no harm.
                 expect(table, n, at + AHEAD, like)
         _decode_lanes(
-            addresses, kinds, pairs, levels, like, coarse, clip, gray, shift, sizes, noise, limits, at, stride,
-            spot, flat, reason,
+            addresses, kinds, pairs, levels, like, coarse, clip, gray, shift, sizes, noise, limits, brief,
+            at, stride, spot, flat, reason,
         )  # fmt: skip
     if solid < end:
         # What is left goes into vectors of its own: nothing may be read beyond a frame's last pixel.
@@ -122,7 +124,7 @@ def decode_codes(
         of_levels = copies_of(levels, solid, end - solid, like, spare_levels)
         _decode_lanes(
             near.reshape(addresses.shape), kinds, pairs, of_levels, like, coarse, clip, gray, shift, sizes, noise,
-            limits, solid, stride, spot, flat, reason,
+            limits, brief, solid, stride, spot, flat, reason,
         )  # fmt: skip
         keep(spare)
         keep(spare_levels)
@@ -144,6 +146,7 @@ def _decode_lanes(
     sizes: NDArray[np.int64],
     noise: NDArray[np.float32],
     limits: NDArray[np.float32],
+    brief: bool,
     at: int,
     stride: int,
     spot: NDArray[np.float32],
@@ -186,11 +189,12 @@ def _decode_lanes(
         store(spot, axis * LANES, (value + _HALF) * step - _HALF)
         store(spot, (axes + axis) * LANES, (spread + _F1) * (step / _ROOT12))
     good = why < 1
-    for row in range(2 * axes):
+    for row in range(axes if brief else 2 * axes):
         stream(maps, row * stride + at, choose(good, load(spot, row * LANES), _NAN))
     stream(maps, 2 * axes * stride + at, choose(good, kept, _F0))
-    stream(maps, (2 * axes + 1) * stride + at, middle)
-    stream(maps, (2 * axes + 2) * stride + at, _HALF * contrast)
+    if not brief:
+        stream(maps, (2 * axes + 1) * stride + at, middle)
+        stream(maps, (2 * axes + 2) * stride + at, _HALF * contrast)
     store(reason, at, why)
 
 

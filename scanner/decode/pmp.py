@@ -1,5 +1,8 @@
 """Decoding PMP: fringe sets of any frequencies and shifts to absolute projector coordinates.
 
+Phase measuring profilometry is Srinivasan's, Liu's and Halioua's (1984); coarser sets tell the periods of finer ones
+(Huntley and Saldner 1993).
+
 Frames are taken in any order, and kept until their axis is whole; it is then decoded in one pass over its frames
 (`pmp_axis`), so that what is left after a scan's last frame is one pass. A pixel whose fringe order is not nearly
 certain, and not plain from its neighbours, stays undecided. How noisy the pixels are is taken from the capture itself:
@@ -8,13 +11,12 @@ from the residual of the fit where a set has four shifts or more, else from how 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode import Decoded, Map, Reason, neighbours
+from scanner.decode import Coordinates, Decoded, Reason, neighbours
 from scanner.decode.agreement import disagreements
 from scanner.decode.frames import FrameCheck
 from scanner.decode.lone_set import require_fringes
@@ -25,17 +27,6 @@ from scanner.decode.unwrapping import plan_ladder
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
 from scanner.patterns.description import Axis
-
-
-@dataclass(frozen=True)
-class Coordinates:
-    """What a scan is triangulated by and no more, (H, W) float32 each: as in `Decoded`."""
-
-    rows: Map | None
-    columns: Map | None
-    confidence: Map
-    warnings: tuple[str, ...]
-    """of frames that are missing or out of step"""
 
 
 class PmpDecoder:
@@ -69,6 +60,7 @@ class PmpDecoder:
         self._check = FrameCheck(sequence, camera)
         self._fringe_at = {position: fringe for fringe, position in enumerate(sequence.fringes)}
         self._frames: dict[int, NDArray[Any]] = {}
+        self._awaited = dict.fromkeys(self._pattern.axes, sum(self._pattern.shifts))
         self._copies: NDArray[Any] | None = None
         self._maps = {axis: AxisMaps.empty(camera.width * camera.height) for axis in self._pattern.axes}
         self._found: dict[Axis, AxisFound] = {}
@@ -146,12 +138,9 @@ class PmpDecoder:
     def _took(self, fringe: int, frame: NDArray[Any]) -> None:
         self._frames[fringe] = frame
         # An axis that is whole before the last one's frames come is decoded in the meantime.
-        per_axis = sum(self._pattern.shifts)
-        index = fringe // per_axis
-        axis = self._pattern.axes[index]
-        if len(self._frames) < len(self._fringe_at) and all(
-            n in self._frames for n in range(index * per_axis, (index + 1) * per_axis)
-        ):
+        axis = self._pattern.axes[fringe // sum(self._pattern.shifts)]
+        self._awaited[axis] -= 1
+        if not self._awaited[axis] and len(self._frames) < len(self._fringe_at):
             self._decode(axis)
 
     def _missing(self) -> tuple[str, ...]:

@@ -20,18 +20,15 @@ from scanner.patterns.description import Axis
 
 
 @dataclass(frozen=True)
-class AxisFrames:
-    """The frames of one axis, by sets; F counts each set's up to a multiple of GROUP.
+class AxisFits:
+    """What each set's frames weigh in its fit, by sets; F counts each set's up to a multiple of GROUP.
 
-    frames: kept while addresses are in use. addresses: (F,) intp. starts: (K + 1,) intp, where sets begin.
-    weights: (3, F) float32 of A, p and q. grams: (K, 6) float32 of the normal matrices. whole: (K,) shifts of sets
-    that have all of their 4 or 8, or 0. gains: (K,) variance of (p, q)
-    over that of one sample. freedom: degrees of freedom of all sets' residuals. angles: of each set's shifts, radians;
-    empty for a set that lost some.
+    starts: (K + 1,) intp, where sets begin. weights: (3, F) float32 of A, p and q. grams: (K, 6) float32 of the normal
+    matrices. whole: (K,) shifts of sets that have all of their 4 or 8, or 0. gains: (K,) variance of (p, q) over that
+    of one sample. freedom: degrees of freedom of all sets' residuals. angles: of each set's shifts, radians; empty for
+    a set that lost some.
     """
 
-    frames: Sequence[NDArray[Any]]
-    addresses: NDArray[np.intp]
     starts: NDArray[np.intp]
     weights: NDArray[np.float32]
     grams: NDArray[np.float32]
@@ -39,6 +36,14 @@ class AxisFrames:
     gains: tuple[float, ...]
     freedom: int
     angles: tuple[NDArray[np.float64], ...]
+
+
+@dataclass(frozen=True)
+class AxisFrames(AxisFits):
+    """The frames of one axis, and their fits. frames: kept while addresses are in use. addresses: (F,) intp."""
+
+    frames: Sequence[NDArray[Any]]
+    addresses: NDArray[np.intp]
 
     @property
     def shifts(self) -> tuple[int, ...]:
@@ -65,27 +70,11 @@ def axis_frames(pattern: PmpPattern, axis: Axis, by_fringe: Mapping[int, NDArray
             frames += [by_fringe[fringe_set.first + n] for n in have + have[:1] * (-len(have) % GROUP)]
             there.append(have)
     fits = _fits_of(pattern, tuple(there))
-    return AxisFrames(
-        frames, addresses_of(frames), fits.starts, fits.weights, fits.grams, fits.whole, fits.gains, fits.freedom,
-        fits.angles,
-    )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _Fits:
-    """What of `AxisFrames` owes nothing to the frames."""
-
-    starts: NDArray[np.intp]
-    weights: NDArray[np.float32]
-    grams: NDArray[np.float32]
-    whole: NDArray[np.intp]
-    gains: tuple[float, ...]
-    freedom: int
-    angles: tuple[NDArray[np.float64], ...]
+    return AxisFrames(**vars(fits), frames=frames, addresses=addresses_of(frames))
 
 
 @lru_cache(maxsize=32)
-def _fits_of(pattern: PmpPattern, there: tuple[tuple[int, ...], ...]) -> _Fits:
+def _fits_of(pattern: PmpPattern, there: tuple[tuple[int, ...], ...]) -> AxisFits:
     # Every scan of a rig asks for the same, and nobody writes into it.
     starts, weights, grams, whole, gains, freedom = [0], [], [], [], [], 0
     angles: list[NDArray[np.float64]] = []
@@ -102,7 +91,7 @@ def _fits_of(pattern: PmpPattern, there: tuple[tuple[int, ...], ...]) -> _Fits:
         alpha = shift_angles(pattern, shifts, have)
         angles.append(alpha if len(have) == shifts else alpha[:0])
         starts.append(starts[-1] + len(have) + padding)
-    return _Fits(
+    return AxisFits(
         np.array(starts, np.intp), np.concatenate(weights, axis=1).astype(np.float32), np.array(grams, np.float32),
         np.array(whole, np.intp), tuple(gains), freedom, tuple(angles),
     )  # fmt: skip

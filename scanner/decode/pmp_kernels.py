@@ -4,7 +4,8 @@ Frames are given by the addresses of their pixels, so that they may lie anywhere
 Work goes through the image by vectors of pixels (`scanner.lanes`). A vector's samples are read once; sums, phases,
 fringe orders and the verdict follow, and only phases and modulations go through memory in between, a few cache lines.
 What no pixel of a vector needs is left out: a way up the ladder where nothing is lit, an exponential where no order is
-in doubt. What a pixel's noise is, and how the ladder of beats climbs, is decided by the caller.
+in doubt. What a pixel's noise is, and how the ladder of beats climbs, is decided by the caller. Each rung in proportion
+picks the period of the next (Huntley and Saldner 1993); the noise of a phase from that of its samples: Surrel 1997.
 """
 
 from __future__ import annotations

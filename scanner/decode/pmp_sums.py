@@ -2,8 +2,8 @@
 
 Frames are given by the addresses of their pixels, so that they may lie anywhere: in memory, or in the map of a file.
 A set that is whole and has four or eight shifts is fitted by the halves that are each other's negative, in whole
-numbers as far as these go; any other set goes through least squares, frame by frame. What is made of the phases is the
-business of `pmp_kernels`.
+numbers as far as these go (synchronous detection: Bruning et al. 1974); any other set goes through least squares, frame
+by frame (Greivenkamp 1984). What is made of the phases is the business of `pmp_kernels`.
 """
 
 from __future__ import annotations

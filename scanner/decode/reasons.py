@@ -34,11 +34,12 @@ def _count_all(reason: NDArray[np.uint8], counts: NDArray[np.int64]) -> None:
 @contracting_kernel
 def count_reasons(reason: NDArray[np.uint8], counts: NDArray[np.int64]) -> None:
     """Add to counts, (REASONS,), how many of up to 65,535 pixels have each reason."""
-    values = _how_many(reason, 0)
-    counts[0] += values
-    if values < reason.size:
-        for why in range(1, REASONS):
-            counts[why] += _how_many(reason, why)
+    left = reason.size
+    for why in range(REASONS):
+        if left > 0:
+            found = _how_many(reason, why)
+            counts[why] += found
+            left -= found
 
 
 @contracting_kernel

@@ -90,6 +90,20 @@ def test_positions_are_those_of_the_plain_form(code, inverse, levels, axes):
     np.testing.assert_allclose(np.median(found.modulation), 0.4 * 255, atol=1)
 
 
+def test_coordinates_alone_are_those_of_all_maps():
+    sequence = sequence_of(GrayPattern(("x", "y"), bits=7, code_bits=9))
+    camera = CameraFormat(203, 149)
+    frames = [frame for frame in take(sequence, camera, noise=0.05) if frame[0] != 5]
+    expected, brief = decode(sequence, frames, camera), GrayDecoder(sequence, camera)
+    for position, frame in frames:
+        brief.add(position, frame)
+    found = brief.coordinates()
+    assert 0.2 < np.isfinite(found.rows).mean() < 1
+    for name in ("rows", "columns", "confidence"):
+        assert np.array_equal(getattr(found, name), getattr(expected, name), equal_nan=True)
+    assert found.warnings == expected.warnings != ()
+
+
 def sigma_or(found):
     return found.sigma_columns if found.sigma_columns is not None else found.sigma_rows
 
