@@ -5,8 +5,11 @@
 Real processes on simulated devices, spool and scans in DIR (default: the temporary directory): daemon, devices process,
 worker. Times are CLOCK_MONOTONIC from the end of the last frame's exposure, as frames.jsonl has it; the clocks of
 simulated devices run in real time. The client asks for the points when it is told that they are there, and has them
-when `xyz` and `confidence` are arrays. The worker's own stages come from the report; the check of the frames runs
-beside the stages from decoding to filtering. Medians, least and most; the first scan is not counted.
+when `xyz` and `confidence` are arrays. The worker's own stages come from the report; of several frames all but the
+check are over before the last exposure ends. Medians, least and most; the first scan is not counted.
+
+What the simulation costs: the camera gives its last frame 5 ms after the exposure (`readout`), which the frame's event
+follows; and its pictures take processor time of the devices process, told for the whole scan beside that of the others.
 
 Then the files by themselves, in this process: the last scan saved again and again, in turn with the same bytes written
 raw to the same folder with the same fsync, in DIR and in memory (/dev/shm, where no disk plays a part). Ratios are of
@@ -76,12 +79,16 @@ def one_scan(client: Client, method: str, folder: Path | None) -> dict[str, floa
     """Milliseconds by what they are of, of one scan, which is deleted afterwards; its files go to `folder`."""
     job = client.start_scan(method)
     told: dict[str, int] = {}
+    before = processor_ms(client)
     for event in client.events(job, patience_s=120):
         told.setdefault(event.kind, time.monotonic_ns())
+        if event.kind == "frame" and event.fields["captured"] == event.fields["total"]:
+            told["all"] = time.monotonic_ns()
         if event.kind == "points":
             arrays = client.arrays(event)
             told["here"] = time.monotonic_ns()
             assert arrays["xyz"].shape[:2] == arrays["confidence"].shape
+    spent = {name: ms - before[name] for name, ms in processor_ms(client).items()}
     outcome = client.result(job)
     assert outcome["state"] == "done", outcome["error"]
     sizes = {entry["name"]: entry["bytes"] for entry in outcome["files"]}
@@ -90,17 +97,31 @@ def one_scan(client: Client, method: str, folder: Path | None) -> dict[str, floa
     end_ns = max(r["exposure"]["end_ns"] for r in map(json.loads, lines) if r["status"] == "ok")
     last = {name: (at - end_ns) / 1e6 for name, at in told.items()}
     found = {
-        "told that the capture is on the disk": last["acquired"],
+        "told that the last frame is there": last["all"],
         "told that the points are there": last["points"],
         "XYZ and confidence in the client's memory": last["here"],
+        "told that the capture is on the disk": last["acquired"],
         "told that scan.npz is whole": last["decoded"],
         "told that all is done": last["done"],
     }
     found |= {f"  worker: {stage}": 1e3 * seconds for stage, seconds in report["timings"].items()}
+    found |= {f"  processor time, whole scan: {name}": ms for name, ms in spent.items()}
     if folder is not None:
         client.fetch(job, folder)
     client.delete(job)
     return found
+
+
+def processor_ms(client: Client) -> dict[str, float]:
+    """Processor time so far of the daemon, its two children and this client, ms."""
+    daemon = int(client.hello()["daemon"]["pid"])
+    spent = {"client": 1e3 * time.process_time()}
+    for pid in (daemon, *map(int, Path(f"/proc/{daemon}/task/{daemon}/children").read_text().split())):
+        words = Path(f"/proc/{pid}/cmdline").read_bytes()
+        name = "devices, simulation and all" if b"devices_process" in words else "worker" if pid != daemon else "daemon"
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        spent[name] = 1e3 * (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return spent
 
 
 def fetched(client: Client, job: str, size: int, name: str = "scan.npz") -> bytes:

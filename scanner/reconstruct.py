@@ -6,11 +6,10 @@ One path for every caller: the decode worker feeds frames as they arrive, `fring
 from __future__ import annotations
 
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,61 +17,34 @@ import numpy as np
 
 from scanner.calibration.watch import watched
 from scanner.capture import Capture, CaptureHeader
-from scanner.capture.exposure import exposure_report, exposure_warnings
+from scanner.capture.exposure import exposure_warnings
 from scanner.carrier_check import require_carriers
 from scanner.compare import compare
 from scanner.contrast import widen_at_edges
 from scanner.decode import Decoded, Decoder, KeepingDecoder, decoder_for
 from scanner.decode.repeated import Repetitions
 from scanner.decode.stages import Observer
+from scanner.decode_options import DecodeOptions, require_sizes
 from scanner.devices import Pixels, Truth
 from scanner.empty_scan import raise_if_empty
-from scanner.errors import CalibrationError, DecodeError
-from scanner.filter_settings import FilterSettings
+from scanner.errors import DecodeError, ScannerError
 from scanner.geometry import Calibration, load_calibration
-from scanner.patterns import GrayPattern, GrayPmpPattern, McpPattern, PatternSequence, PmpPattern
+from scanner.patterns import FrameRole, GrayPattern, GrayPmpPattern, McpPattern, PatternSequence, PmpPattern
 from scanner.ripple_correction import widen_by_ripple, without_ripple
 from scanner.scale_check import require_codes_within, require_geometry
 from scanner.scan import Map, Scan, build_scan
-from scanner.sequencer import CaptureCheck, check_capture
+from scanner.scan_report import report_of_capture
+from scanner.sequencer import CaptureCheck, Hearing, check_capture
 from scanner.uncertainty import budget_of
 
 TRUTH_FILE = "truth.npz"
+_OF_ORDER = (FrameRole.SENTINEL, FrameRole.BARS)
 
 Progress = Callable[[str], None]
 """Told the name of each stage as it begins."""
 
 OnPoints = Callable[[Map, Map], None]
-"""Takes xyz (H, W, 3) and confidence (H, W), both float32 and final."""
-
-
-@dataclass(frozen=True)
-class DecodeOptions:
-    """What a user may choose about decoding."""
-
-    decoder: str = "default"
-    filters: FilterSettings = field(default_factory=FilterSettings)
-    compare_truth: bool = False
-    correct_ripple: bool = False
-    """PMP: take off what the response has put into coordinates, as far as the frequencies tell"""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data, for the wire and for reports."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> DecodeOptions:
-        """The options that `as_dict` described; absent members have their defaults.
-
-        Raises:
-            ConfigError: a member has a value that makes no sense.
-        """
-        return cls(
-            decoder=str(content.get("decoder", "default")),
-            filters=FilterSettings.from_dict(content.get("filters") or {}),
-            compare_truth=bool(content.get("compare_truth", False)),
-            correct_ripple=bool(content.get("correct_ripple", False)),
-        )
+"""Takes xyz (H, W, 3) and confidence (H, W), both float32 and final, where the frames are in step."""
 
 
 class Reconstruction:
@@ -81,6 +53,10 @@ class Reconstruction:
     `add` each frame as it arrives, then `finish` with the closed folder. Repetitions of the sequence are decoded one
     after the other, each as soon as it is whole, and averaged. A frame that was taken again after it was added makes
     `finish` decode from the folder: retakes are rare, and sums cannot forget.
+
+    Frames behind the last one that is decoded say only whether all are in step. Who adds them while they are captured
+    calls `listen` and `solve` meanwhile, `check` behind the last one, which has little left to do, and `finish` when
+    nobody waits for points any more.
     """
 
     def __init__(
@@ -109,6 +85,13 @@ class Reconstruction:
         )
         self._failed: dict[int, DecodeError] = {}
         self._slots: dict[int, int | None] = {}
+        sequence = self._header.sequence
+        # The others tell whether the frames are in step, and no more.
+        self._decoded_at = {p for p in range(len(sequence)) if sequence.role(p) not in _OF_ORDER}
+        self._awaited = self._header.repeat * len(self._decoded_at)
+        self._hearing = Hearing(sequence, self._header.camera.max_value)
+        self._early: Scan | ScannerError | None = None
+        self._made: tuple[Scan, CaptureCheck] | ScannerError | None = None
 
     def add(self, pattern: int, frame: Pixels, slot: int | None = None, *, stays: bool = False) -> None:
         """Take one frame.
@@ -126,24 +109,69 @@ class Reconstruction:
         if pattern in self._slots or not 0 <= pattern < self._header.frame_count:
             return
         repetition, position = divmod(pattern, len(self._header.sequence))
-        with self._timed("decode frames"):
-            if repetition not in self._decoders:
-                self._decoders[repetition] = self._new_decoder()
-            decoder = self._decoders[repetition]
-            take = decoder.keep if stays and isinstance(decoder, KeepingDecoder) else decoder.add
-            take(position, frame)
+        if repetition not in self._decoders and not self._is_whole(repetition):
+            self._decoders[repetition] = self._new_decoder()
+        if position in self._decoded_at:
+            self._awaited -= 1
+            with self._timed("decode frames"):
+                decoder = self._decoders[repetition]
+                take = decoder.keep if stays and isinstance(decoder, KeepingDecoder) else decoder.add
+                take(position, frame)
         self._slots[pattern] = slot
-        if self._header.repeat > 1 and self._is_whole(repetition):
+        camera = self._header.camera
+        if len(self._header.sequence) > 1 and (camera.bits in (8, 16) or int(frame.max()) <= camera.max_value):
+            self._hearing.take(pattern, frame)  # else it is no frame of this camera, as the check will find
+        if self._header.repeat > 1 and position in self._decoded_at and self._is_whole(repetition):
             self._end_repetition(repetition)
 
-    def finish(self, capture: Capture, progress: Progress | None = None, points: OnPoints | None = None) -> Scan:
-        """The scan, once all frames are there; the folder may still be open.
+    @property
+    def may_be_solved(self) -> bool:
+        """Whether all frames that are decoded are there, and it was not `solve`d yet."""
+        return self._early is None and self._awaited == 0
+
+    def listen(self, pattern: int) -> None:
+        """Ask what the frames of a pattern's repetition say of their order, where only its last ones are missing."""
+        self._hearing.listen(pattern)
+
+    def solve(self, capture: Capture, progress: Progress | None = None, points: OnPoints | None = None) -> None:
+        """Make the scan as far as it can be; errors are `finish`'s to raise. Args: as `check`."""
+        try:
+            self._early = self._with_edges(self._solved(capture, progress or (lambda _: None), points))
+        except ScannerError as error:
+            self._early = error
+
+    def check(
+        self,
+        capture: Capture,
+        progress: Progress | None = None,
+        points: OnPoints | None = None,
+        sure: Callable[[], None] | None = None,
+    ) -> None:
+        """Make the scan, all but its report, and check the frames, once all are there; errors are `finish`'s to raise.
 
         Args:
-            capture: the folder.
+            capture: the folder; it may still be open.
             progress: told each stage.
-            points: takes xyz and confidence as soon as they are sure, where there is a calibration: sigmas and report
-                are still to come.
+            points: takes xyz and confidence as soon as they are final, where there is a calibration and `solve` did
+                not give them: sigmas and report are still to come.
+            sure: called behind `points`, once the frames are known to be in step.
+        """
+        tell = progress or (lambda _: None)
+        tell("checking frames")
+        try:
+            self._catch_up(capture)
+            self._made = self._solved_and_checked(capture, tell, points, sure)
+        except ScannerError as error:
+            self._made = error
+
+    def finish(
+        self,
+        capture: Capture,
+        progress: Progress | None = None,
+        points: OnPoints | None = None,
+        sure: Callable[[], None] | None = None,
+    ) -> Scan:
+        """The scan, once all frames are there and the folder is closed. Args: as `check`, whose work is not done again.
 
         Raises:
             SyncError: the frames are out of step.
@@ -151,23 +179,16 @@ class Reconstruction:
             CalibrationError: the rig cannot triangulate this pattern's axis.
         """
         tell = progress or (lambda _: None)
-        tell("checking frames")
         self._catch_up(capture)
-        with ThreadPoolExecutor(1, thread_name_prefix="check") as beside:
-            checking = beside.submit(self._checked, capture)
-            try:
-                scan = self._solved(capture, tell, checking, points)
-            except Exception:
-                checking.result()  # frames out of step say more than what comes of them
-                raise
-            check = checking.result()
+        if self._made is None:
+            self.check(capture, progress, points, sure)
+        if not isinstance(self._made, tuple):
+            raise self._made or AssertionError("check has set it")
+        scan, check = self._made
         phase_axis = "y" if self._calibration is None else self._calibration.phase_axis
-        if isinstance(self._header.sequence.pattern, PmpPattern | GrayPmpPattern):
-            with self._timed("widen sigmas"):
-                scan = widen_at_edges(scan, phase_axis)
         scan = scan.with_report(
             sync=check.as_dict(),
-            capture=self.capture_report(capture),
+            capture=report_of_capture(capture),
             uncertainty=self._budget(scan, check.mixed_share),
         )
         scan = widen_by_ripple(scan, self._header.sequence, phase_axis)
@@ -180,12 +201,43 @@ class Reconstruction:
 
     def _checked(self, capture: Capture) -> CaptureCheck:
         with self._timed("check"):
-            return check_capture(capture).raise_if_out_of_step()
+            return check_capture(capture, self._hearing).raise_if_out_of_step()
 
-    def _solved(
-        self, capture: Capture, tell: Progress, checking: Future[CaptureCheck], points: OnPoints | None
-    ) -> Scan:
-        """Maps and points; `points` is told when the frames are checked, too."""
+    def _solved_and_checked(
+        self, capture: Capture, tell: Progress, points: OnPoints | None, sure: Callable[[], None] | None
+    ) -> tuple[Scan, CaptureCheck]:
+        """The scan, if it was not made early, and the check in a thread beside it: frames out of step say more."""
+        tell_sure = sure or (lambda: None)
+        if self._early is not None:
+            check = self._checked(capture)
+            if isinstance(self._early, ScannerError):
+                raise self._early
+            tell_sure()
+            return self._early, check
+        with ThreadPoolExecutor(1, thread_name_prefix="check") as beside:
+            checking = beside.submit(self._checked, capture)
+
+            def final(xyz: Map, confidence: Map) -> None:
+                if points is not None:
+                    points(xyz, confidence)
+                checking.result()
+                tell_sure()
+
+            try:
+                scan = self._solved(capture, tell, final)
+            except Exception:
+                checking.result()
+                raise
+            return self._with_edges(scan), checking.result()
+
+    def _with_edges(self, scan: Scan) -> Scan:
+        if not isinstance(self._header.sequence.pattern, PmpPattern | GrayPmpPattern):
+            return scan
+        with self._timed("widen sigmas"):
+            return widen_at_edges(scan, "y" if self._calibration is None else self._calibration.phase_axis)
+
+    def _solved(self, capture: Capture, tell: Progress, points: OnPoints | None) -> Scan:
+        """Maps and points."""
         tell("decoding")
         decoded = self._decoded()
         decoded = replace(decoded, warnings=(*decoded.warnings, *capture.warnings))
@@ -198,16 +250,14 @@ class Reconstruction:
         decoded = self._carriers_fit(self._fits_geometry(decoded), capture)
         tell("triangulating")
 
-        def sure(xyz: Map) -> None:
-            checking.result()
+        def final(xyz: Map) -> None:
             if points is not None:
                 points(xyz, decoded.confidence)
 
-        return build_scan(decoded, self._calibration, self._options.filters, timings=self._timings, points=sure)
+        return build_scan(decoded, self._calibration, self._options.filters, timings=self._timings, points=final)
 
     def _is_whole(self, repetition: int) -> bool:
-        count = len(self._header.sequence)
-        return all(pattern in self._slots for pattern in range(repetition * count, (repetition + 1) * count))
+        return all(repetition * len(self._header.sequence) + p in self._slots for p in self._decoded_at)
 
     def _end_repetition(self, repetition: int) -> None:
         decoder = self._decoders.pop(repetition)
@@ -273,23 +323,8 @@ class Reconstruction:
 
     def _new_decoder(self, observer: Observer | None = None) -> Decoder:
         fit = None if self._calibration is None else self._calibration.extra.get("mcp_phase")
-        return decoder_for(self._header.sequence, self._header.camera, self._options.decoder, observer, fit)
-
-    def capture_report(self, capture: Capture) -> dict[str, Any]:
-        """The report's `capture`: made anew where the folder was closed since."""
-        header = capture.header
-        return {
-            "id": header.id,
-            "created": header.created,
-            "method": header.sequence.pattern.method,
-            "frames": len(capture.records),
-            "shows": Counter(str(header.sequence.role(n)) for n in range(len(header.sequence))),
-            "missing": list(capture.missing),
-            "state": header.state,
-            "reason": header.reason,
-            "repeat": header.repeat,
-            "exposure": exposure_report(header),
-        }
+        options = (self._options.decoder, observer, fit, self._calibration)
+        return decoder_for(self._header.sequence, self._header.camera, *options)
 
     def _compared(self, scan: Scan, capture: Capture) -> Scan:
         with self._timed("compare"):
@@ -323,21 +358,6 @@ def reconstruct(
     for pattern, record in capture.records.items():
         reconstruction.add(pattern, capture.frame(pattern), record.slot, stays=True)
     return reconstruction.finish(capture, progress)
-
-
-def require_sizes(header: CaptureHeader, calibration: Calibration) -> None:
-    """Raise CalibrationError where camera or projector of the capture have another size than the calibration's."""
-    projector = header.sequence.projector
-    for name, calibrated, here, hint in (
-        ("camera", calibration.camera.size, header.camera.shape[::-1], "made with this camera and region"),
-        ("projector", calibration.projector.size, (projector.width, projector.height), "made with this projector"),
-    ):
-        if calibrated != here:
-            raise CalibrationError(
-                f"the calibration is for a {name} of {calibrated[0]} x {calibrated[1]}, "
-                f"the capture is of one of {here[0]} x {here[1]}",
-                hint=f"use the calibration {hint}",
-            )
 
 
 def ambiguity_px(sequence: PatternSequence) -> float | None:

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from scanner.capture import CaptureHeader
 from scanner.decode import Decoded, Decoder, PositionsDecoder, SeriesDecoder, decoder_for
+from scanner.decode_options import DecodeOptions, require_sizes
 from scanner.devices import Pixels
 from scanner.errors import CalibrationError, DecodeError
 from scanner.geometry import Calibration
 from scanner.kernel import kernel
 from scanner.patterns import Axis, McpPattern
-from scanner.reconstruct import DecodeOptions, require_sizes
 from scanner.scan import Map, Scan, build_scan, filtered_points
 
 LARGEST = 65535
@@ -152,7 +152,13 @@ class LiveReconstruction:
 
     def _new_decoder(self) -> Decoder:
         fit = None if self._calibration is None else self._calibration.extra.get("mcp_phase")
-        return decoder_for(self._header.sequence, self._header.camera, self._options.decoder, mcp_phase=fit)
+        return decoder_for(
+            self._header.sequence,
+            self._header.camera,
+            self._options.decoder,
+            mcp_phase=fit,
+            calibration=self._calibration,
+        )
 
 
 def row_scale(length: int) -> float:

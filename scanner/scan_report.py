@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+from collections import Counter
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
@@ -14,6 +15,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.capture import Capture
+from scanner.capture.exposure import exposure_report
 from scanner.decode import Decoded, Reason
 from scanner.decode.reasons import tally
 from scanner.errors import StorageError
@@ -55,6 +58,8 @@ def report_of(
             "image": share(values, pixels),
             "lit": share(values, lit),
             "points_of_lit": share(points, lit),
+            "undecided_of_lit": share(lit - values, lit),
+            "too_dark": share(pixels - lit, pixels),
         },
         "removed": dict(removed),
         "filters": settings.as_dict(),
@@ -71,6 +76,23 @@ def report_of(
         "versions": versions(),
     }
     return report
+
+
+def report_of_capture(capture: Capture) -> dict[str, Any]:
+    """The report's `capture`: what was captured, and how that ended."""
+    header = capture.header
+    return {
+        "id": header.id,
+        "created": header.created,
+        "method": header.sequence.pattern.method,
+        "frames": len(capture.records),
+        "shows": Counter(str(header.sequence.role(n)) for n in range(len(header.sequence))),
+        "missing": list(capture.missing),
+        "state": header.state,
+        "reason": header.reason,
+        "repeat": header.repeat,
+        "exposure": exposure_report(header),
+    }
 
 
 def read_report(path: Path) -> dict[str, Any]:

@@ -74,6 +74,8 @@ class PointsNote(Struct, frozen=True, tag="points"):
 
     delivery: int
     arrays: list[ArrayEntry]
+    frames: int | None = None
+    """of how many `frame` messages, where it comes before `end`: true if these are all; None: of all"""
 
 
 class DecodedNote(Struct, frozen=True, tag="decoded"):

@@ -243,7 +243,7 @@ EVENTS: tuple[Event, ...] = (
         62,
         "points",
         JOB,
-        {"state": "decoding", "file": "scan.npz", "arrays": [msgspec.to_builtins(array) for array in _ARRAYS]},
+        {"state": "acquiring", "file": "scan.npz", "arrays": [msgspec.to_builtins(array) for array in _ARRAYS]},
     ),
     Event(61, "worker.lost", None, {"worker": "rig-812", "why": "ended with status -9"}),
 )
@@ -276,7 +276,7 @@ STREAM: tuple[Struct, ...] = (
     Ack(DELIVERY, 4),
     End(DELIVERY, "completed", 31, []),
     Progress(DELIVERY, "triangulating"),
-    PointsNote(DELIVERY, list(_ARRAYS)),
+    PointsNote(DELIVERY, list(_ARRAYS), 31),
     DecodedNote(DELIVERY, [_FILE], {"points": 76800}),
     LiveBegin(DELIVERY, LIVE_JOB, {"format": "fringed-capture"}, None, "ipc:///run/fringed/live.ipc", 0),
     LiveFrame(

@@ -119,9 +119,11 @@ class Scan:
                 disk.close("failed", reason_of(error), (), self._ended_by(error))
                 return
             self.lost = outcome.error if isinstance(outcome.error, DeviceLost) else None
-            state: State = "complete" if outcome.reason is FinishReason.COMPLETED else "failed"
+            completed = outcome.reason is FinishReason.COMPLETED
+            # Before anything waits for a disk: clients wait for this word.
+            self._say(Taken(self.job, self._lines if completed and not outcome.missing else None))
+            state: State = "complete" if completed else "failed"
             disk.close(state, outcome.reason.value, outcome.witnesses.as_list(), self._ended_with(outcome))
-        self._say(Taken(self.job))
 
     def _ended_with(self, outcome: Acquisition) -> Callable[[StorageError | None], None]:
         def say(problem: StorageError | None) -> None:

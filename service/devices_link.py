@@ -73,6 +73,9 @@ class ScanListener(Protocol):
     def frames(self, frames: Frames) -> None:
         """More lines are in frames.jsonl."""
 
+    def taken(self, taken: Taken) -> None:
+        """There will be no more of them."""
+
     def live(self, report: LiveBegan | Shot | Kept) -> None:
         """Of a live run: it began, took a frame, or has more on disk."""
 
@@ -216,6 +219,7 @@ class DevicesLink:
                 case Ended():
                     return report
                 case Taken():
+                    listener.taken(report)
                     return None
                 case Need():
                     try:

@@ -26,7 +26,7 @@ from service.endings import error_of, reason_to_fail
 from service.jobs import Job, JobState
 from service.live_files import close_recording, reserve
 from service.live_series import LiveSeries, LiveTotals
-from service.pipe import Ended, Frames, Kept, LiveBegan, Need, Shot
+from service.pipe import Ended, Frames, Kept, LiveBegan, Need, Shot, Taken
 from service.pipeline import Pipeline
 from service.series import recorded_files
 from service.worker_pool import WorkerPool
@@ -230,6 +230,9 @@ class LiveRun:
         """Of scans."""
 
     def frames(self, frames: Frames) -> None:
+        """Of scans."""
+
+    def taken(self, taken: Taken) -> None:
         """Of scans."""
 
     def live(self, report: LiveBegan | Shot | Kept) -> None:

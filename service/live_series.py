@@ -109,8 +109,8 @@ class LiveSeries:
         self.end = SeriesEnd(reason)
         self.changed.set()
 
-    def told(self, message: object) -> None:
-        """Hear a worker."""
+    def hear(self, message: object) -> None:
+        """A worker says something."""
         if isinstance(message, LiveCounts):
             self.counts.add(message)
             if time.monotonic() - self._began > STEADY_S:

@@ -60,8 +60,8 @@ class LiveWork:
             ScannerError: these frames cannot be decoded, or the socket cannot be opened.
         """
         from scanner.capture import CaptureHeader  # noqa: PLC0415  (OpenCV and Numba: after the devices are told)
+        from scanner.decode_options import DecodeOptions  # noqa: PLC0415
         from scanner.geometry import calibration_from_dict  # noqa: PLC0415
-        from scanner.reconstruct import DecodeOptions  # noqa: PLC0415
         from scanner.reconstruct_live import LiveReconstruction  # noqa: PLC0415
 
         self.delivery = begin.delivery

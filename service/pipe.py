@@ -150,6 +150,8 @@ class Taken(Struct, frozen=True, tag="taken"):
     """All frames are taken and the devices are free; the disk is not done yet."""
 
     job: str
+    lines: int | None = None
+    """of frames.jsonl, where all of the scan's frames are there and in step"""
 
 
 class Ended(Struct, frozen=True, tag="ended"):

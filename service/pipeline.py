@@ -26,6 +26,7 @@ from service.pipe import Ended, Need
 from service.scan_hearing import ScanHearing
 from service.series import Series, capture_state, frames_kept, missing_patterns
 from service.spool import Spool, empty_trash
+from service.tasks import Tasks
 from service.worker_pool import WorkerPool
 
 MAX_QUEUED = 256
@@ -51,7 +52,7 @@ class Pipeline:
         self._queued = asyncio.Event()
         self._series: dict[str, Series] = {}
         self._acquiring: Job | None = None
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = Tasks("the pipeline")
         # One thread: records reach the disk in the order in which they were made.
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="records")
 
@@ -73,9 +74,7 @@ class Pipeline:
             deadline = time.monotonic() + 3.0
             while self._acquiring is acquiring and time.monotonic() < deadline:
                 await asyncio.sleep(0.02)
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.close()
         self._disk.shutdown()
 
     @property
@@ -229,6 +228,11 @@ class Pipeline:
         if (series := self._series.get(job.id)) is not None:
             series.grew()
 
+    def taken(self, job: Job, lines: int) -> None:
+        """All of a job's frames are in its folder, in so many lines, and in step; the disk may still be busy."""
+        if (series := self._series.get(job.id)) is not None:
+            series.whole(lines)
+
     # --- decoding -----------------------------------------------------------------------------------------------
 
     def _new_series(self, job: Job) -> Series:
@@ -284,11 +288,11 @@ class Pipeline:
                 job.become(JobState.DECODING)
             self.tell(job, "decoding", {"stage": message.stage})
             return
-        if job.state not in (JobState.ACQUIRED, JobState.DECODING):
-            return
         if isinstance(message, PointsNote):
             job.arrays = tuple(message.arrays)
             self.tell(job, "points", {"file": "scan.npz", "arrays": msgspec.to_builtins(message.arrays)})
+            return
+        if job.state not in (JobState.ACQUIRED, JobState.DECODING):
             return
         job.files, job.report = tuple(message.files), message.report
         job.become(JobState.DECODED)
@@ -389,13 +393,6 @@ class Pipeline:
                 _log.error("old scans cannot be deleted now: %s", problem)
             await asyncio.sleep(SWEEP_S)
 
-    def spawn(self, coroutine: Any) -> None:
+    def spawn(self, coroutine: Coroutine[Any, Any, None]) -> None:
         """Run beside everything else; ended with the pipeline."""
-        task: asyncio.Task[None] = asyncio.create_task(coroutine)
-        self._tasks.add(task)
-        task.add_done_callback(self._finished)
-
-    def _finished(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            _log.error("a task of the pipeline failed", exc_info=error)
+        self._tasks.spawn(coroutine)

@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING
 
 from service.jobs import Job
-from service.pipe import Frames, Kept, LiveBegan, Need, Shot
+from service.pipe import Frames, Kept, LiveBegan, Need, Shot, Taken
 
 if TYPE_CHECKING:
     from service.pipeline import Pipeline
@@ -42,6 +42,11 @@ class ScanHearing:
         self._told = now
         counts = {"captured": frames.captured, "total": job.total, "retakes": frames.retakes}
         self._pipeline.tell(job, "retake" if all_there and frames.retakes else "frame", counts)
+
+    def taken(self, taken: Taken) -> None:
+        """All of its frames are in the folder, which is being closed."""
+        if taken.lines is not None:
+            self._pipeline.taken(self._job, taken.lines)
 
     def live(self, report: LiveBegan | Shot | Kept) -> None:
         """Of a live run."""

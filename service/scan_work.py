@@ -1,8 +1,9 @@
 """One scan in the worker: frames of its series in, files out.
 
-Frames are mapped from the spool, checked against their digests, and given to `scanner.reconstruct` as they come. When
-the last one is there, the scan is made at once, while the devices still judge the frames and the disk closes their
-folder; nothing of it is told before the series has ended, and frames that are taken again make it void.
+Frames are mapped from the spool, checked against their digests, and given to `scanner.reconstruct` as they come. The
+scan is made as soon as all that are decoded are there, while the sentinels behind them are exposed; with the last one
+it is known whether all are in step, and where the points are is said, of so many frames. Everything else is told when
+the series has ended, and frames that are taken again make it void.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.errors import DecodeError, ScannerError
+from scanner.errors import DecodeError
 from scanner.scan_report import read_report
 from scanner.storage import Digests, prepare_output, remove_empty
 from scanner.stream import Ack, DecodedNote, End, Frame, FromWorker, PointsNote, Progress, Result, Start
@@ -61,10 +61,11 @@ class ScanWork:
         """of the frames that are here, by pattern"""
         self._digests: dict[int, str] = {}
         """of slots whose pixels were checked"""
-        self._early: Scan | ScannerError | None = None
+        self._retaken = False
         self._writing = ExitStack()
         self._writer: ScanWriter | None = None
-        self._points: Future[None] | None = None
+        self._arrays: list[ArrayEntry] = []
+        """of the points that are in scan.npz"""
 
     def begin(self) -> None:
         """Read capture.json, make ready."""
@@ -74,7 +75,8 @@ class ScanWork:
         self._header = capture.header
         self._frames = _MappedFrames(self._header)
         if self._decode:
-            from scanner.reconstruct import DecodeOptions, Reconstruction, calibration_for  # noqa: PLC0415
+            from scanner.decode_options import DecodeOptions  # noqa: PLC0415
+            from scanner.reconstruct import Reconstruction, calibration_for  # noqa: PLC0415
 
             options = DecodeOptions.from_dict(self._start.options)
             self._reconstruction = Reconstruction(self._header, calibration_for(capture), options)
@@ -90,8 +92,8 @@ class ScanWork:
         if message.slot is not None and message.status == "ok":
             pixels = self._frames.at(message)
         if self._reconstruction is not None:
-            self._give_up_early()
-            self._slots.pop(message.pattern, None)
+            if self._slots.pop(message.pattern, None) is not None:
+                self._give_up_early()
             if pixels is not None and message.slot is not None:
                 self._reconstruction.add(message.pattern, pixels, message.slot, stays=True)
                 self._slots[message.pattern] = message.slot
@@ -99,8 +101,8 @@ class ScanWork:
                     self._digests[message.slot] = message.xxh3
         if self._taken % ACK_EVERY == 0:
             self._words.say(Ack(self.delivery, self._taken))
-        if self._early is None and self._reconstruction is not None and len(self._slots) == self._header.frame_count:
-            self._scan_early()
+        if self._reconstruction is not None:
+            self._go_ahead(self._reconstruction, message.pattern)
 
     def heard(self, end: End) -> None:
         """The series has ended, and this message waits its turn: nothing has to be kept back. From another thread."""
@@ -123,26 +125,27 @@ class ScanWork:
 
     def close(self) -> None:
         """Leave nothing half-written. May be called twice."""
-        if self._points is not None:
-            wait([self._points])
-        self._points, self._writer = None, None
+        self._arrays, self._writer = [], None
         self._writing.close()
 
     # --- the scan -----------------------------------------------------------------------------------------------
 
-    def _scan_early(self) -> None:
-        """Make the scan before the series has ended: nothing is told of it yet, not even its failure."""
-        self._words.keep_back(self._taken)
-        try:
-            self._early = self._solved(self._capture())
-        except ScannerError as error:
-            self._early = error
+    def _go_ahead(self, reconstruction: Reconstruction, pattern: int) -> None:
+        """Do what can be done with the frames so far: nothing is told of it yet, not even its failure."""
+        if len(self._slots) == self._header.frame_count:
+            self._words.keep_back(self._taken)
+            reconstruction.check(self._capture(), self._stage, self._put_points, self._tell_points)
+            return
+        if not self._retaken and reconstruction.may_be_solved:
+            self._words.keep_back(None)
+            reconstruction.solve(self._capture(), self._stage, self._put_points)
+        reconstruction.listen(pattern)
 
     def _give_up_early(self) -> None:
-        """A frame came after what seemed to be the last one: what was made without it is void."""
-        if self._early is not None:
-            self._early = None
-            self.close()
+        """A frame was taken again: what was made without it is void, and the rest waits for the last one."""
+        self._retaken = True
+        self._words.forget()
+        self.close()
 
     def _capture(self) -> Capture:
         from scanner.capture import Capture  # noqa: PLC0415
@@ -156,26 +159,12 @@ class ScanWork:
             close_interrupted(self._folder, "failed", message.reason)
         capture = self._capture()
         present = {pattern: record.slot for pattern, record in capture.records.items()}
-        if self._early is not None and present != self._slots:
+        if present != self._slots:
             self._give_up_early()
         self._words.tell_all()
-        if isinstance(self._early, ScannerError):
-            raise self._early
         if self._reconstruction is None:
             raise AssertionError("begin made it")
-        if self._early is None:
-            return self._solved(capture)
-        return self._early.with_report(capture=self._reconstruction.capture_report(capture))
-
-    def _solved(self, capture: Capture) -> Scan:
-        if self._reconstruction is None:
-            raise AssertionError("begin made it")
-        with ThreadPoolExecutor(1, thread_name_prefix="points") as beside:
-
-            def points(xyz: Map, confidence: Map) -> None:
-                self._points = beside.submit(self._write_points, xyz, confidence)
-
-            return self._reconstruction.finish(capture, self._stage, points)
+        return self._reconstruction.finish(capture, self._stage, self._put_points, self._tell_points)
 
     # --- files --------------------------------------------------------------------------------------------------
 
@@ -188,15 +177,18 @@ class ScanWork:
             self._writer = self._writing.enter_context(ScanWriter(self._output, self._digests_of))
         return self._writer
 
-    def _write_points(self, xyz: Map, confidence: Map) -> None:
+    def _put_points(self, xyz: Map, confidence: Map) -> None:
+        if self._arrays:
+            self.close()  # those of frames that were taken again since
         places = self._begin_files().points(xyz, confidence)
-        arrays = [ArrayEntry(p.name, p.dtype, p.shape, p.offset, p.bytes) for p in places]
-        self._words.tell(PointsNote(self.delivery, arrays))
+        self._arrays = [ArrayEntry(p.name, p.dtype, p.shape, p.offset, p.bytes) for p in places]
+
+    def _tell_points(self) -> None:
+        if self._arrays:
+            self._words.say(PointsNote(self.delivery, self._arrays, self._taken))
 
     def _files(self, scan: Scan) -> Result:
         began = time.perf_counter()
-        if self._points is not None:
-            self._points.result()
         writer = self._begin_files()
         entries: list[FileEntry] = []
 
@@ -228,7 +220,8 @@ class _Words:
         self._delivery = delivery
         self._lock = threading.Lock()
         self._early: int | None = None
-        """frames taken when the scan was begun early; None: nothing is kept back"""
+        """frames that the scan is made of"""
+        self._back = False
         self._kept: list[FromWorker] = []
         self._frames: int | None = None
         """of a series that has ended well"""
@@ -240,15 +233,22 @@ class _Words:
     def tell(self, message: FromWorker) -> None:
         """Say what follows from the frames."""
         with self._lock:
-            if self._early is None or self._early == self._frames:
-                self._answer(message)
-            else:
+            if self._back and (self._early is None or self._early != self._frames):
                 self._kept.append(message)
+            else:
+                self._answer(message)
 
-    def keep_back(self, frames: int) -> None:
-        """From now on, unless the series has ended with so many frames."""
+    def keep_back(self, frames: int | None) -> None:
+        """From now on, unless the series has ended with so many frames; None: it cannot have ended yet."""
         with self._lock:
-            self._early, self._kept = frames, []
+            self._back, self._early = True, frames
+            if frames is not None and frames == self._frames:
+                self._tell_kept()
+
+    def forget(self) -> None:
+        """What was kept back is void."""
+        with self._lock:
+            self._kept = []
 
     def may_tell(self, frames: int) -> None:
         """The series has ended well with so many frames: if these are all that there were, what was kept is told."""
@@ -260,7 +260,7 @@ class _Words:
     def tell_all(self) -> None:
         """The series has ended: nothing is kept back any more."""
         with self._lock:
-            self._early = None
+            self._back = False
             self._tell_kept()
 
     def _tell_kept(self) -> None:

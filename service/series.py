@@ -54,9 +54,12 @@ class Series:
     """hears of each delivery before it begins, with its number"""
     deliveries: int = 0
     end: SeriesEnd | None = None
+    lines: int | None = None
+    """of frames.jsonl, once there will be no more"""
     cancelled: bool = False
     changed: asyncio.Event = field(default_factory=asyncio.Event)
     outcome: asyncio.Future[Result] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
+    _points: PointsNote | None = None
 
     def grew(self) -> None:
         """There are more lines."""
@@ -66,6 +69,29 @@ class Series:
         """There will be no more lines."""
         self.end = SeriesEnd(reason, missing)
         self.changed.set()
+
+    def whole(self, lines: int) -> None:
+        """So many lines there are, and no more will come: what a worker made of these is told."""
+        self.lines = lines
+        self._tell_points()
+
+    def hear(self, message: Progress | PointsNote | DecodedNote | LiveCounts) -> None:
+        """A worker says something. Points that it made of the frames so far wait until these are known to be all."""
+        if isinstance(message, PointsNote):
+            self._points = message
+            self._tell_points()
+        else:
+            self.told(message)
+
+    def forget_points(self) -> None:
+        """The worker that had them is gone."""
+        self._points = None
+
+    def _tell_points(self) -> None:
+        points = self._points
+        if points is not None and (points.frames is None or points.frames == self.lines):
+            self._points = None
+            self.told(points)
 
     def output(self, delivery: int) -> Path:
         """Where a delivery's worker writes the scan."""

@@ -47,6 +47,7 @@ from service.jobs import MAX_DELIVERIES
 from service.live_series import LiveSeries
 from service.series import RecordTail, Series
 from service.sockets import send_now
+from service.tasks import Tasks
 
 RETRY_S = 0.1
 RESPAWN_MAX_S = 10.0
@@ -81,15 +82,15 @@ class WorkerPool:
         self._children: dict[int, Child] = {}
         # Numbers of an earlier daemon's deliveries must not come again: a worker of it may still be alive.
         self._numbers = itertools.count(time.time_ns() >> 10)
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = Tasks("the worker pool")
         self._closing = False
 
     def start(self, workers: int) -> None:
         """Begin to listen, and start `workers` processes."""
-        self._task(self._listen())
-        self._task(self._watch())
+        self._tasks.spawn(self._listen())
+        self._tasks.spawn(self._watch())
         for _ in range(workers):
-            self._task(self._keep_worker())
+            self._tasks.spawn(self._keep_worker())
 
     def submit(self, series: Series | LiveSeries) -> None:
         """Have a series decoded; its `outcome` says when. A live run does not wait behind others."""
@@ -134,9 +135,7 @@ class WorkerPool:
         self._closing = True
         for seat in self._seats.values():
             self._send(seat, Stop())
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.close()
         await asyncio.gather(*(child.stop() for child in self._children.values()))
 
     # --- workers ------------------------------------------------------------------------------------------------
@@ -187,6 +186,8 @@ class WorkerPool:
         series = delivery.series
         if series.outcome.done():
             return
+        if isinstance(series, Series):
+            series.forget_points()
         if series.deliveries < MAX_DELIVERIES:
             _log.warning("job %s: %s; its series is sent again", series.job, why)
             self._parked.appendleft(series)
@@ -254,7 +255,7 @@ class WorkerPool:
                 delivery.acked = max(delivery.acked, frames)
                 delivery.wake.set()
             case Progress() | PointsNote() | DecodedNote() | LiveCounts():
-                delivery.series.told(message)
+                delivery.series.hear(message)
             case Result() | Failed() | Released():
                 self._over(seat, delivery, message)
 
@@ -268,6 +269,8 @@ class WorkerPool:
                 case Failed(error=error):
                     delivery.series.outcome.set_exception(error_from_body(error))
                 case Released():
+                    if isinstance(delivery.series, Series):
+                        delivery.series.forget_points()
                     self._parked.appendleft(delivery.series)
         self._assign()
 
@@ -285,7 +288,9 @@ class WorkerPool:
             seat.delivery = delivery = Delivery(next(self._numbers), series)
             series.delivering(delivery.number)
             live = isinstance(series, LiveSeries)
-            delivery.sender = self._task(self._send_live(seat, delivery) if live else self._send_series(seat, delivery))
+            delivery.sender = self._tasks.spawn(
+                self._send_live(seat, delivery) if live else self._send_series(seat, delivery)
+            )
 
     def _next_for(self, seat: Seat) -> Series | LiveSeries | None:
         """Of the series that wait the first that this worker can take."""
@@ -337,6 +342,7 @@ class WorkerPool:
                     delivery.wake.clear()
                     await delivery.wake.wait()
                 elif end is not None:
+                    series.whole(tail.sent)
                     await self._deliver(seat, delivery, End(delivery.number, end.reason, tail.sent, list(end.missing)))
                     return
                 else:
@@ -368,14 +374,3 @@ class WorkerPool:
     def _stop_sender(self, delivery: Delivery) -> None:
         if delivery.sender is not None:
             delivery.sender.cancel()
-
-    def _task(self, coroutine: Any) -> asyncio.Task[None]:
-        task: asyncio.Task[None] = asyncio.create_task(coroutine)
-        self._tasks.add(task)
-        task.add_done_callback(self._finished)
-        return task
-
-    def _finished(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            _log.error("a task of the worker pool failed", exc_info=error)

@@ -8,6 +8,7 @@ from scanner.sequencer.endless import EndlessFrame, endless
 from scanner.sequencer.exposure import ExposureChoice
 from scanner.sequencer.exposure import auto as auto_exposure
 from scanner.sequencer.findings import Witness, Witnesses
+from scanner.sequencer.hearing import Hearing
 from scanner.sequencer.latency import measure as measure_latency
 from scanner.sequencer.plan import Mode, Plan, light_unit_ns, plan
 from scanner.sequencer.rig import Rig
@@ -24,6 +25,7 @@ __all__ = [
     "FinishReason",
     "FrameSink",
     "FrameVerdict",
+    "Hearing",
     "Mode",
     "Plan",
     "Rig",

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from scanner.capture import Capture
-from scanner.devices import Pixels
 from scanner.errors import DecodeError
 from scanner.sequencer.disorder import RECORDED_HINT, sync_error
 from scanner.sequencer.findings import Witnesses
+from scanner.sequencer.hearing import Hearing
 from scanner.sequencer.plan import Plan
-from scanner.sequencer.thumbnail import thumbnail
 from scanner.sequencer.verify import FrameVerdict, mixed_share, summary, verify
 from scanner.sequencer.witness import witness
 
@@ -79,10 +78,13 @@ class CaptureCheck:
         }
 
 
-def check_capture(capture: Capture) -> CaptureCheck:
+def check_capture(capture: Capture, hearing: Hearing | None = None) -> CaptureCheck:
     """Verify the stamps and question the content of a capture's frames.
 
     Frames that are missing are not an error here: whether the rest can be decoded is the method's to say.
+
+    Args:
+        hearing: of those of its frames that were seen already; the others are read.
 
     Raises:
         DecodeError: a frame cannot be read.
@@ -95,12 +97,11 @@ def check_capture(capture: Capture) -> CaptureCheck:
     witnesses = Witnesses() if count > 1 else witness(header.sequence, {}, header.camera.max_value)
     if count > 1:
         for repetition in range(header.repeat):
-            shown: dict[int, Pixels] = {
-                position: thumbnail(capture.frame(repetition * count + position))
-                for position in range(count)
-                if repetition * count + position in capture.records
-            }
-            witnesses = witnesses.joined(witness(header.sequence, shown, header.camera.max_value))
+            here = hearing or Hearing(header.sequence, header.camera.max_value)
+            for pattern in range(repetition * count, (repetition + 1) * count):
+                if pattern in capture.records and not here.has(pattern):
+                    here.take(pattern, capture.frame(pattern))
+            witnesses = witnesses.joined(here.witnesses(repetition, among=capture.records))
     return CaptureCheck(capture, plan, tuple(verdicts), witnesses)
 
 

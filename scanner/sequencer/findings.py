@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from typing import Any
 
@@ -107,10 +107,14 @@ class Scene:
         """Mean level of a frame over the lit pixels."""
         return float(self.frames[position][self.lit].mean())
 
+    def with_frames(self, thumbnails: Mapping[int, Pixels]) -> Scene:
+        """The same scene, seen by these frames, of which it has some already."""
+        return replace(self, frames=_samples(thumbnails, self.frames))
+
 
 def look(sequence: PatternSequence, thumbnails: Mapping[int, Pixels], max_value: int) -> Scene | None:
     """Take the thumbnails as samples: noise, lit pixels. None if no pixel changes beyond the noise."""
-    frames = {p: pixels.reshape(-1).astype(np.float32) for p, pixels in sorted(thumbnails.items())}
+    frames = _samples(thumbnails)
     shape = next(iter(thumbnails.values())).shape
     noise = _noise(sequence, frames, (int(shape[0]), int(shape[1])))
     spread = _spread(list(frames.values()))
@@ -169,6 +173,11 @@ def equal_positions(sequence: PatternSequence) -> Iterable[tuple[float, tuple[in
     return [(level, tuple(sorted(positions))) for level, positions in levels.items()]
 
 
+def _samples(thumbnails: Mapping[int, Pixels], known: Mapping[int, Array] | None = None) -> dict[int, Array]:
+    known = known or {}
+    return {p: known[p] if p in known else thumbnails[p].reshape(-1).astype(np.float32) for p in sorted(thumbnails)}
+
+
 def _spread(frames: Sequence[Array]) -> Array:
     """(P,) largest minus smallest level of each sample.
 
@@ -196,7 +205,7 @@ def _noise(sequence: PatternSequence, frames: Mapping[int, Array], shape: tuple[
     grain = float(np.quantile([_grain(frames[a] - frames[b], shape) for a, b in pairs], 0.25))
     for _, positions in sorted(equal_positions(sequence), reverse=True):
         here = [p for p in positions if p in frames]
-        found = [sigma_between(*_brighter(frames[a], frames[b])) for a, b in combinations(here, 2)]
+        found = [sigma_between(*_equally_lit(*_brighter(frames[a], frames[b]))) for a, b in combinations(here, 2)]
         if found := [sigma for sigma in found if sigma > 0]:
             return max(min([*found, max(3 * grain, LEAST_NOISE)]), LEAST_NOISE)
     return max(grain, LEAST_NOISE)
@@ -226,3 +235,9 @@ def _brighter(a: Array, b: Array) -> tuple[Array, Array]:
     both = a + b
     use = both >= np.median(both)
     return a[use], b[use]
+
+
+def _equally_lit(a: Array, b: Array) -> tuple[Array, Array]:
+    """Two frames with the lamp's drift between them taken out: 1-3 % in seconds would be more than the noise."""
+    of_a, of_b = float(a.mean()), float(b.mean())
+    return (a, b * np.float32(of_a / of_b)) if of_b > 0 else (a, b)

@@ -18,13 +18,12 @@ from scanner.errors import DeviceLost, ScannerError, SyncError
 from scanner.patterns import PatternSequence
 from scanner.sequencer.disorder import set_of, sync_error
 from scanner.sequencer.findings import Witnesses
+from scanner.sequencer.hearing import Hearing
 from scanner.sequencer.plan import Mode, Plan
 from scanner.sequencer.rig import Rig
 from scanner.sequencer.steady import Steady
-from scanner.sequencer.thumbnail import thumbnail
 from scanner.sequencer.triggered import TriggeredRounds
 from scanner.sequencer.verify import FrameVerdict, judge, summary, verify
-from scanner.sequencer.witness import witness
 
 _TRIGGER_MODES = {
     Mode.FREE: TriggerMode.FREE,
@@ -199,15 +198,14 @@ class _Run:
         self.on_frame, self.cancelled, self.stop_on_overrun = on_frame, cancelled, stop_on_overrun
         self.records: list[FrameRecord] = []
         self.attempts: dict[int, int] = {}
-        self.thumbnails: dict[int, Pixels] = {}
         self.verdicts: list[FrameVerdict] = []
         self.witnesses = Witnesses()
         self.retakes = self.dropped = 0
-        self.max_value = rig.camera.capabilities.max_value
+        self.hearing = Hearing(sequence, rig.camera.capabilities.max_value)
 
     def prepare(self) -> None:
         self.camera.apply(replace(self.settings, exposure_ns=self.plan.exposure_ns))
-        self.max_value = self.camera.capabilities.max_value
+        self.hearing = Hearing(self.sequence, self.camera.capabilities.max_value)
 
     def finished(self, reason: FinishReason, error: ScannerError | None) -> Acquisition:
         self.verdicts = verify(self.plan, self.sequence, self.records)
@@ -283,7 +281,7 @@ class _Run:
         for pattern in patterns:
             self.go_on()
             flip = self.projector.show(pattern % self.plan.patterns)
-            frame = self.software(flip) if self.plan.mode is Mode.SOFTWARE else self.free(flip)
+            frame = self.software(pattern, flip) if self.plan.mode is Mode.SOFTWARE else self.free(pattern, flip)
             if frame is None:
                 self.missing(pattern, flip)
             else:
@@ -300,19 +298,21 @@ class _Run:
             flip = self.projector.show(black)
             self.clock.sleep_until(flip.t_ns + self.plan.period_ns)
 
-    def software(self, flip: Flip) -> CameraFrame | None:
+    def software(self, pattern: int, flip: Flip) -> CameraFrame | None:
         """Wait for the light, trigger, take this trigger's frame; older ones that still come are dropped."""
         self.clock.sleep_until(flip.t_ns + flip.bound_ns + self.plan.trigger_delay_ns)
         called_ns = self.clock.now_ns()
         self.camera.trigger()
+        self.hearing.listen(pattern)  # while it is exposed
         until = called_ns + self.plan.pop_timeout_ns
         while (frame := self.camera.pop(max(0, until - self.clock.now_ns()))) is not None:
             if frame.exposure.start_ns + frame.exposure.bound_ns >= called_ns:
                 return frame
         return None
 
-    def free(self, flip: Flip) -> CameraFrame | None:
+    def free(self, pattern: int, flip: Flip) -> CameraFrame | None:
         """The first frame that certainly began in the new light. The pattern stays on until it has arrived."""
+        self.hearing.listen(pattern)  # while it is exposed
         ready = flip.t_ns + flip.bound_ns + self.plan.window_start_ns
         until = ready + self.plan.pop_timeout_ns
         while (frame := self.camera.pop(max(0, until - self.clock.now_ns()))) is not None:
@@ -323,7 +323,7 @@ class _Run:
 
     def take(self, pattern: int, flip: Flip, frame: CameraFrame) -> None:
         if self.plan.patterns > 1 and pattern < self.plan.patterns * self.plan.repeat:
-            self.thumbnails[pattern] = thumbnail(frame.pixels)
+            self.hearing.take(pattern, frame.pixels)
         slot, digest = self.sink.write(frame.pixels)
         record = FrameRecord(
             slot,
@@ -339,7 +339,7 @@ class _Run:
         self.put(record, self.sink.offset(slot))
 
     def missing(self, pattern: int, flip: Flip) -> None:
-        self.thumbnails.pop(pattern, None)
+        self.hearing.lose(pattern)
         self.put(FrameRecord(None, pattern, self.attempt(pattern), "missing", flip=flip), None)
 
     def attempt(self, pattern: int) -> int:
@@ -364,12 +364,7 @@ class _Run:
         for repetition in range(self.plan.repeat):
             first = repetition * self.plan.patterns
             # Frames already known to be wrong would only confuse the content of the others.
-            shown = {
-                pattern - first: pixels
-                for pattern, pixels in self.thumbnails.items()
-                if first <= pattern < first + self.plan.patterns and pattern not in found
-            }
-            seen = witness(self.sequence, shown, self.max_value)
+            seen = self.hearing.witnesses(repetition, without=found)
             self.witnesses = seen if repetition == 0 else self.witnesses.joined(seen)
             found.update(first + position for position in seen.suspects)
             if seen.whole:

@@ -85,7 +85,8 @@ def decode(
     with progress_lines() as lines:
         lines.stage("opening the capture")
         from scanner.capture import Capture  # noqa: PLC0415  (array libraries and kernels)
-        from scanner.reconstruct import DecodeOptions, calibration_for, reconstruct  # noqa: PLC0415
+        from scanner.decode_options import DecodeOptions  # noqa: PLC0415
+        from scanner.reconstruct import calibration_for, reconstruct  # noqa: PLC0415
         from scanner.stage_pictures import StageFolder  # noqa: PLC0415
         from scanner.storage import not_there, prepare_output, remove_empty  # noqa: PLC0415
 

@@ -87,7 +87,8 @@ def _frames(path: Path) -> Iterator[_Frame]:
 
 
 def _decoder(capture: Capture, calibration: Path | None, settings: Mapping[str, Any]) -> LiveReconstruction:
-    from scanner.reconstruct import DecodeOptions, calibration_for  # noqa: PLC0415
+    from scanner.decode_options import DecodeOptions  # noqa: PLC0415
+    from scanner.reconstruct import calibration_for  # noqa: PLC0415
     from scanner.reconstruct_live import LiveReconstruction  # noqa: PLC0415
 
     lenses = calibration_for(capture, calibration)

@@ -18,9 +18,9 @@ import zmq
 
 from scanner.capture import Capture
 from scanner.client import AsyncClient, Client
+from scanner.decode_options import DecodeOptions
 from scanner.errors import ConfigError, DeviceBusy, ScannerError
 from scanner.geometry import calibration_from_dict, load_calibration
-from scanner.reconstruct import DecodeOptions
 from scanner.reconstruct_live import LiveReconstruction
 from scanner.scan import load_scan
 from scanner.series import read_series

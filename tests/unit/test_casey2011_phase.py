@@ -10,6 +10,7 @@ import pytest
 from scanner import reconstruct, reconstruct_live
 from scanner.capture.header import CaptureHeader
 from scanner.decode import decoder_for
+from scanner.decode_options import DecodeOptions
 from scanner.geometry import Calibration, Lens
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
 
@@ -63,7 +64,7 @@ def test_a_scan_s_decoder_is_told_the_fit_of_its_calibration(fit, monkeypatch):
     lens = Lens((256, 192), matrix, np.zeros(5))
     rig = Calibration(lens, lens, np.eye(3), np.array([0.0, 100, 0]), extra={"mcp_phase": fit})
     header = CaptureHeader(PatternSequence(SIZE, PATTERN), CAMERA, frames=("0.png",))
-    options = reconstruct.DecodeOptions(decoder="casey2011")
+    options = DecodeOptions(decoder="casey2011")
     reconstruct.Reconstruction(header, rig, options)
     reconstruct_live.LiveReconstruction(header, rig, options)
     assert asked == [fit, fit]

@@ -324,10 +324,10 @@ async def test_a_run_passes_on_the_newest_frames_and_forgives_steady_workers() -
         series.shot(Shot("run", number, "/ring", 0, "", number, 0, 0, 3))
     assert [f.number for f in series.take(7)] == [6, 7, 8, 9]
     assert (series.counts.captured, series.counts.lost) == (10, 3)
-    series.told(counts(next=10))
+    series.hear(counts(next=10))
     assert series.deliveries == 2
     series._began -= 60
-    series.told(counts(next=10))
+    series.hear(counts(next=10))
     assert series.deliveries == 1
 
 

@@ -12,7 +12,8 @@ import pytest
 from scanner.devices import Pixels
 from scanner.patterns import GrayPattern, PatternSequence, PmpPattern
 from scanner.patterns.description import Axis
-from scanner.sequencer import Witnesses, witness
+from scanner.sequencer import Hearing, Witnesses, witness
+from scanner.sequencer.witness import hear
 from tests.unit.sequencer_bench import QUICK, Taken, gray, pmp, take
 
 SCENES = ("board", "sphere_board", "sphere_dark", "blocks", "bust", "textured", "two_albedo", "wedge")
@@ -328,3 +329,35 @@ def test_white_and_black_exchanged() -> None:
     assert capture.sequence.black is not None
     white, black = capture.sequence.white, capture.sequence.black
     assert not questioned(capture, {white: black, black: white}).passed
+
+
+# --- heard before the last frames ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [{}, {5: 6, 6: 5}, {4: 3}], ids=["sound", "exchanged", "doubled"])
+def test_listening_while_the_last_frames_are_exposed_changes_no_verdict(order: dict[int, int]) -> None:
+    capture = taken("8 shifts")
+    shown, last = reordered(capture, order), capture.sequence.sentinels[-2:]
+    hearing = Hearing(capture.sequence, capture.format.max_value)
+    asked = []
+    for position, source in ((p, order.get(p, p)) for p in sorted(shown)):
+        hearing.listen(position)
+        asked.append(bool(hearing._heard))
+        hearing.take(position, capture.frames[source])
+    assert asked.index(True) == last[0]
+    assert hearing.witnesses(0) == questioned(capture, order)
+    for position in last:  # one that shows fringes in place of light
+        hearing.take(position, capture.frames[5])
+        assert hearing.witnesses(0).suspects
+        hearing.take(position, capture.frames[position])
+    hearing.take(7, capture.frames[9])  # taken again, and wrong: what was heard counts for nothing
+    assert 7 in hearing.witnesses(0).suspects
+
+
+def test_a_lamp_that_drifts_does_not_pass_for_noise() -> None:
+    capture = taken("8 shifts")
+    dimmed = {p: (pixels * (0.97 if p > 5 else 1.0)).astype(np.uint8) for p, pixels in capture.thumbnails.items()}
+    steady, drifting = (hear(capture.sequence, shown, 255).scene for shown in (capture.thumbnails, dimmed))
+    assert steady is not None
+    assert drifting is not None
+    assert drifting.noise < 1.25 * steady.noise

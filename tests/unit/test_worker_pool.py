@@ -14,7 +14,21 @@ import pytest
 from scanner.capture import CaptureHeader, CaptureWriter, FrameRecord
 from scanner.errors import StorageError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
-from scanner.stream import Alive, Cancel, End, Frame, FromWorker, Identify, Ready, Released, Result, Start, ToWorker
+from scanner.stream import (
+    Alive,
+    Cancel,
+    End,
+    Frame,
+    FromWorker,
+    Identify,
+    Leaving,
+    PointsNote,
+    Ready,
+    Released,
+    Result,
+    Start,
+    ToWorker,
+)
 from scanner.stream import decode_to_worker as decoded
 from service.children import Child
 from service.devices_link import DevicesLink
@@ -114,6 +128,36 @@ async def test_a_damaged_line_costs_no_frame_behind_it(tmp_path: Path) -> None:
         await router.say(READY)
         assert len(router.of(Frame)) == READY.credit
         assert not router.of(End)
+
+
+async def test_points_are_told_once_their_frames_are_known_to_be_all(tmp_path: Path) -> None:
+    told: list[Any] = []
+    async with a_pool() as (pool, router):
+        series = captured(tmp_path / "capture", 3)
+        series.end, series.told = None, told.append
+        pool.submit(series)
+        await router.say(READY)
+        (start,) = router.of(Start)
+        await router.say(PointsNote(start.delivery, [], 2))
+        series.whole(3)
+        assert not told
+        await router.say(PointsNote(start.delivery, [], 3))
+        assert [note.frames for note in told] == [3]
+        series.finish("completed")
+        await router.say(PointsNote(start.delivery, []))  # of all, behind the end
+        assert [note.frames for note in told] == [3, None]
+
+
+async def test_points_of_a_worker_that_is_gone_are_not_told(tmp_path: Path) -> None:
+    told: list[Any] = []
+    async with a_pool() as (pool, router):
+        series = captured(tmp_path / "capture")
+        series.end, series.told = None, told.append
+        pool.submit(series)
+        await router.say(READY)
+        await router.say(PointsNote(router.of(Start)[0].delivery, [], 1), Leaving())
+        series.whole(1)
+        assert not told
 
 
 async def test_a_machine_without_processes_left_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
