@@ -15,10 +15,11 @@ import pytest
 
 from scanner.clock import VirtualClock
 from scanner.errors import StorageError
-from scanner.wire import FileEntry, ScanStart
+from scanner.stream import PointsNote
+from scanner.wire import ArrayEntry, FileEntry, ScanStart
 from service.acquisition import Scan
 from service.jobs import Job, JobState, JobStore
-from service.pipe import CancelAcquire, Ended, framed, read_command
+from service.pipe import CancelAcquire, Ended, Taken, framed, read_command
 from service.pipeline import Pipeline
 from service.series import Series
 from service.spool import Spool
@@ -29,8 +30,10 @@ class Devices:
 
     def __init__(self) -> None:
         self.ended: asyncio.Future[Ended] = asyncio.get_running_loop().create_future()
+        self.listener: Any = None
 
     async def acquire(self, job: str, _folder: Path, _params: ScanStart, listener: Any) -> Awaitable[Ended]:
+        self.listener = listener
         listener.began()
         return self.ended
 
@@ -125,6 +128,22 @@ async def test_nothing_is_told_of_a_scan_behind_its_end(bench: Bench) -> None:
         await asyncio.sleep(0)
     assert bench.events[-1] == "cancelled"
     assert bench.workers.given[0].end is None
+
+
+async def test_points_are_told_before_the_disk_is_done_and_acquired_is_not(bench: Bench) -> None:
+    job = await bench.acquiring()
+    places = [ArrayEntry("xyz", "<f4", (2, 2, 3), 64, 48)]
+    bench.workers.given[0].hear(PointsNote(1, places, 1))
+    assert "points" not in bench.events
+    bench.devices.listener.taken(Taken(job.id))  # and some are missing
+    assert "points" not in bench.events
+    bench.devices.listener.taken(Taken(job.id, 1))
+    assert (bench.events[-1], job.state) == ("points", JobState.ACQUIRING)
+    assert job.readable("scan.npz") == 112
+    assert not job.result()["files"]
+    bench.end(job)
+    await until(bench, "acquired")
+    assert bench.events.count("points") == 1
 
 
 async def test_asking_again_waits_for_the_record_too(bench: Bench) -> None:
