@@ -1,7 +1,7 @@
 """The hidden Markov model of the MCP decoder: its true rates and its constants, and whether scans should estimate them.
 
     python bench/mcp_hmm.py rates [--rigs casey2011,bench2026,quick] [--scenes bust,blocks] [--patterns own] [--seeds 1]
-    python bench/mcp_hmm.py worth [--only MISS,STRAY,estimated] [...]
+    python bench/mcp_hmm.py worth [--only MISS,STRAY,estimated] [--scenes tilt] [--options offset_mm=300] [...]
 
 `rates`, for each scene: what really happens at its peaks (against truth), and the same as the decoded scan has it
 (peaks decided with .9 and more, and strays as sure). STRAY is the share of peaks that are no stripe; the others are of
@@ -68,9 +68,9 @@ class Case:
     mm_per_row: Any
 
 
-def case_of(rig, scene, pattern_name, seed):
+def case_of(rig, scene, pattern_name, seed, options=""):
     """One scene; None where it is refused."""
-    device = f"{rig}/{scene}?seed={seed}"
+    device = f"{rig}/{scene}?seed={seed}" + (f"&{options}" if options else "")
     pattern = pattern_of(device, rig, pattern_name)
     frame, sequence, camera, truth, calibration = take(device, pattern)
     model = PatternModel.of(pattern, sequence.projector)
@@ -363,6 +363,7 @@ def main():
     parser.add_argument("--scenes", default=SCENES)
     parser.add_argument("--patterns", default="own,published")
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--options", default="", help="of the simulated world, key=value&key=value")
     parser.add_argument("--only", default="", help="worth: these constants alone, or `estimated`")
     chosen = parser.parse_args()
     cases = [
@@ -371,7 +372,7 @@ def main():
         for scene in chosen.scenes.split(",")
         for name in chosen.patterns.split(",")
         for seed in range(chosen.seeds)
-        if (case := case_of(rig, scene, name, seed)) is not None
+        if (case := case_of(rig, scene, name, seed, chosen.options)) is not None
     ]
     if chosen.part == "rates":
         print_rates(cases)

@@ -322,3 +322,35 @@ def test_a_change_of_scene_or_a_dark_frame_is_searched_anew():
     again = add_and_finish(decoder, other)
     assert searched(again)
     np.testing.assert_array_equal(again.rows, alone.rows)
+
+
+def test_a_surface_that_comes_nearer_is_followed_and_searched_anew_only_where_that_does_not_hold():
+    decoder = decoder_for(PatternSequence(PROJECTOR, OWN), CAMERA)
+    searches, pitches = [], []
+    for near in (1.0, 1.015, 1.03, 1.12):
+
+        def rows(y, x, near=near):
+            return tuple(c + (plain - c) / near for c, plain in zip((144, 192), smooth_rows(y, x), strict=True))
+
+        frame, truth = render(OWN, rows)
+        decoded = add_and_finish(decoder, frame)
+        decoder.next_frame()
+        at = np.rint(decoded.peaks[:, 1]).astype(int), np.rint(decoded.peaks[:, 0]).astype(int)
+        assert (np.abs(decoded.peaks[:, 2] - truth[at]) < OWN.pitch_px(PROJECTOR) / 2).mean() > 0.995
+        searches.append(searched(decoded))
+        pitches.append(decoded.details["pitch_px"])
+    assert searches == [True, False, False, True]
+    assert pitches[0] == pitches[2] < pitches[3]
+
+
+def test_modulation_is_each_frame_s_own_in_a_series_too():
+    frame, _ = render(OWN)
+    blurred = cv2.GaussianBlur(frame, (0, 0), 1.5)
+    decoder = decoder_for(PatternSequence(PROJECTOR, OWN), CAMERA)
+    sharp = add_and_finish(decoder, frame)
+    decoder.next_frame()
+    after = add_and_finish(decoder, blurred)
+    assert not searched(after)
+    alone = decode_image(blurred, OWN, PROJECTOR, CAMERA)
+    np.testing.assert_allclose(after.details["modulation"], alone.details["modulation"], atol=0.01)
+    assert min(np.subtract(sharp.details["modulation"], after.details["modulation"])) > 0.1

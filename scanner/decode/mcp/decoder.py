@@ -17,7 +17,7 @@ from scanner.decode.mcp.locate import Array, Found, Image, Known, Stages, locate
 from scanner.decode.mcp.maps import fill_rows, maps_of
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.ranks import median
-from scanner.decode.mcp.stripes import MIN_PITCH_PX
+from scanner.decode.mcp.resolution import if_whole, refuse_too_fine
 from scanner.decode.mcp.white import RATIO_BITS, divided, in_grey_levels
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
@@ -163,15 +163,16 @@ def _see_anew(upright: Image, model: PatternModel, camera: CameraFormat) -> _See
     a = max(decided.agreement, again.agreement, key=lambda agreement: agreement.agree)
     if a.exchanged:
         words = " and ".join(str(word) for word in a.exchanged)
-        raise DecodeError(
-            f"the codes contradict the description: code words {words} stand in one another's places",
-            hint='exchange them in the description\'s "codes" if that is what is projected',
+        said = f"the codes contradict the description: code words {words} stand in one another's places"
+        hint = 'exchange them in the description\'s "codes" if that is what is projected'
+    else:
+        said = (
+            "stripes and carriers are there, but the codes contradict the description "
+            f"(of {a.clear:.0%} clear code words {a.agree:.0%} fit, {a.order:.0%} of neighbours are in order)"
         )
-    raise DecodeError(
-        "stripes and carriers are there, but the codes contradict the description "
-        f"(of {a.clear:.0%} clear code words {a.agree:.0%} fit, {a.order:.0%} of neighbours are in order)",
-        hint="check bits, carriers, codes and axis of the description against what is projected",
-    )
+        hint = "check bits, carriers, codes and axis of the description against what is projected"
+    refuse_too_fine(upright, model, camera, said, structure=True)
+    raise DecodeError(said, hint=hint)
 
 
 def _learnt(found: Found, decided: Decision, *, upside_down: bool) -> Known:
@@ -280,22 +281,12 @@ class McpDecoder:
 
 
 def _explain(found: Found, image: Image, model: PatternModel, camera: CameraFormat) -> None:
-    """Raise what `locate` found wrong; a pattern turned by 90 degrees is named."""
+    """Raise what `locate` found wrong; a pattern turned by 90 degrees, or too fine for the camera, is named."""
     if found.pitch > 0:
         _refuse_turned(image, model, camera)
-    hints = [hint for hint in (found.hint, _too_fine(image, model)) if hint is not None]
+    refuse_too_fine(image, model, camera, str(found.fault), structure=found.pitch > 0)
+    hints = [hint for hint in (found.hint, if_whole(image, model)) if hint is not None]
     raise DecodeError(str(found.fault), hint="; ".join(hints) or None)
-
-
-def _too_fine(image: Image, model: PatternModel) -> str | None:
-    """What to do where stripes are finer than can be decoded even if the pattern fills the picture."""
-    pitch = image.shape[0] / model.stripes
-    if pitch >= MIN_PITCH_PX:
-        return None
-    return (
-        f"stripes may be too fine for this camera: {model.stripes} on {image.shape[0]} px are {pitch:.1f} px high, "
-        f"{MIN_PITCH_PX:g} are needed. Take frames of more pixels, move the camera nearer, or project fewer bits"
-    )
 
 
 def _refuse_turned(image: Image, model: PatternModel, camera: CameraFormat) -> None:
