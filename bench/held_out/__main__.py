@@ -7,6 +7,7 @@ import shutil
 import sys
 import tempfile
 import time
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -43,6 +44,8 @@ PIXELS = (
 )
 STRIPES = ("right", "recall", "pzmed", "p1mm", "pbeyond", "punlit")
 
+ONE_FRAME = ("mcp", "published", "cp")
+
 
 def decoded(folder, truth):
     """Found of a capture folder, opened as anybody's, and its scan."""
@@ -68,13 +71,13 @@ def main():
     parser.add_argument("--scenes", default=",".join(SCENES))
     parser.add_argument("--methods", default="mcp,published,pmp", help=f"of {', '.join(METHODS)}")
     parser.add_argument("--axis", choices=("x", "y"), help="instead of the one that suits the rig")
-    parser.add_argument("--scale", type=float, default=1.0, help="of the camera's pixels")
+    parser.add_argument("--scale", type=float, help="of the camera's pixels; by default 1, and 0.5 for many frames")
     parser.add_argument("--rays", type=int, default=2, help="along a pixel's side")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--plain", action="store_true", help="no sentinels and bars round sequences")
     parser.add_argument("--keep", type=Path, help="folder for captures")
     parser.add_argument("--relit", type=Path, nargs="+", help="PMP captures of real scenes, to be relit by MCP")
-    parser.add_argument("--page", type=Path, metavar="TEXT", help="write the documentation's page, ended by this text")
+    parser.add_argument("--page", action="store_true", help="write the documentation's page")
     parser.add_argument("--again", type=Path, nargs="+", help="kept captures to be decoded, nothing else")
     chosen = parser.parse_args()
     cv2.setNumThreads(1)
@@ -91,13 +94,16 @@ def main():
         return 0
     root = chosen.keep or Path(tempfile.mkdtemp(prefix="held-out-"))
     found = []
-    for rig_name in chosen.rigs.split(","):
-        rig = RIGS[rig_name].at(chosen.scale)
-        for scene in chosen.scenes.split(","):
-            view = view_of(SCENES[scene], rig, chosen.rays)
-            for method in chosen.methods.split(","):
-                told = _one(view, method, root / f"{rig_name}-{scene}-{method}", chosen)
-                found.append((rig_name, scene, method, told))
+    methods = chosen.methods.split(",")
+    groups = {1.0: [m for m in methods if m in ONE_FRAME], 0.5: [m for m in methods if m not in ONE_FRAME]}
+    groups = groups if chosen.scale is None else {chosen.scale: methods}
+    for rig_name, scene, scale in product(chosen.rigs.split(","), chosen.scenes.split(","), groups):
+        if not groups[scale]:
+            continue
+        view = view_of(SCENES[scene], RIGS[rig_name].at(scale), chosen.rays)
+        for method in groups[scale]:
+            told = _one(view, method, root / f"{rig_name}-{scene}-{method}", chosen)
+            found.append((rig_name, scene, method, told))
     if chosen.keep is None:
         shutil.rmtree(root)
     _page(found, chosen)
@@ -105,8 +111,8 @@ def main():
 
 
 def _page(found, chosen):
-    if chosen.page is not None:
-        print(page.write(found, chosen.page.read_text(encoding="utf-8")))
+    if chosen.page:
+        print(page.write(found))
 
 
 def _one(view, method, folder, chosen):

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from tables.page import FOLDER, Grid
+
+SAID = Path(__file__).with_name("said.md")
 
 STRIPES = {
     "right": "Right",
@@ -52,8 +56,8 @@ DIFFERS = """## What it shows
 """
 
 
-def page(found, said):
-    """Markdown of (rig, scene, method, Found) rows."""
+def page(found):
+    """Markdown of (rig, scene, method, Found) rows, ended by what SAID says of them."""
     parts = [WORDS]
     for caption, names, chosen in (
         (
@@ -61,7 +65,7 @@ def page(found, said):
             STRIPES,
             True,
         ),
-        ("Methods of several frames, camera at 0.6 of its pixels:", PIXELS, False),
+        ("Methods of several frames, camera at half of its pixels:", PIXELS, False),
     ):
         rows = [
             [rig, scene, method, *(told.figures.get(name) for name in names)]
@@ -73,11 +77,11 @@ def page(found, said):
         if rows:
             head = ["Rig", "Scene", "Method", *names.values()]
             parts.append(Grid(head, rows, caption, places=3).markdown())
-    return "\n".join([*parts, DIFFERS.format(said=said.strip())])
+    return "\n".join([*parts, DIFFERS.format(said=SAID.read_text(encoding="utf-8").strip())])
 
 
-def write(found, said):
+def write(found):
     """Into the documentation; its path."""
     path = FOLDER / "held-out.md"
-    path.write_text(page(found, said), encoding="utf-8")
+    path.write_text(page(found), encoding="utf-8")
     return path

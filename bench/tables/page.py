@@ -80,4 +80,5 @@ def index(entries: Sequence[tuple[str, str, str]]) -> str:
         "Pattern Method of Structured Light 3D Capture*, University of Kentucky 2011. The decoder is the reference\n"
         "decoder, `--decoder casey2011`, unless a page says otherwise. How it works: [Modified\n"
         "Composite Pattern](../../explanation/mcp.md).\n\n" + "\n".join(lines) + "\n"
+        "- [Scenes and rigs that nobody tuned for](held-out.md) (`cd bench && python -m held_out`)\n"
     )
