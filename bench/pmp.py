@@ -6,8 +6,9 @@ For one thread and for as many as there are: ms to decode frames that are all at
 coordinates and confidence alone (`coordinates`); ms a frame and after the last one where they come one by one, and how
 much that is beyond a pass over frames at hand; reading all frames once, and writing two float32 maps besides; a decode
 with OpenCV and NumPy; and `fringes` (PyPI, mode "fast"), if it is installed. Frames rotate over several stacks, so that
-none is still in a cache from the run before. Medians and least times; ratios are medians of ratios of what ran one
-after the other. A decoder and its maps are made before its time runs, as in a scan.
+none is still in a cache from the run before. Medians and (least) times; ratios are medians of ratios of what ran one
+after the other, and (those of the least times): a busy machine moves medians of what takes long, and of two threads
+more than of one. A decoder and its maps are made before its time runs, as in a scan.
 """
 
 from __future__ import annotations
@@ -91,18 +92,18 @@ def measure(kind, sequence, camera, stacks, runs, threads):
         ("read once, write two maps", floor),
         ("read once", reading),
     ):
-        to_floor, to_reading = (median_ratio(times, other) for other in (floor, reading))
+        to_floor, to_reading = (ratio(times, other) for other in (floor, reading))
         print(
             f"  {label:30s}{1e3 * np.median(times):8.2f} ({1e3 * min(times):.2f})"
-            f"   {to_floor:5.2f} x read and write, {to_reading:5.2f} x read"
+            f"   {to_floor} x read and write, {to_reading} x read"
         )
     beyond = np.subtract(finishing, whole)
     print(f"  {'after the last, beyond a pass':30s}{1e3 * np.median(beyond):8.2f} ({1e3 * min(beyond):.2f})")
 
 
-def median_ratio(times, others):
-    """Median of the ratios of what ran one after the other: a neighbour's load that slows both leaves it as it is."""
-    return np.median(np.divide(times, others))
+def ratio(times, others):
+    """Median of the ratios of what ran one after the other, and that of the least times, which nobody disturbed."""
+    return f"{np.median(np.divide(times, others)):5.2f} ({min(times) / min(others):.2f})"
 
 
 def keep_all(decoder, frames):
@@ -123,7 +124,7 @@ def measure_others(sequence, camera, stacks, runs):
     """Print what others need for the same frames; one thread is theirs to choose.
 
     Theirs and ours run in turns. Each ratio is that of one run of theirs to the median of the three of ours around it;
-    what is told is their median, and what half of them lie between.
+    what is told is their median, what half of them lie between, and the ratio of the least times.
     """
     others = {"OpenCV and NumPy": lambda frames: plain_decode(sequence.pattern, frames)}
     if importlib.util.find_spec("fringes") is not None:
@@ -134,7 +135,7 @@ def measure_others(sequence, camera, stacks, runs):
         print("fringes is not installed: no comparison with it")
     for name, decode in others.items():
         decode(stacks[0])
-        times, ratios = [], []
+        times, ours, ratios = [], [], []
         for run in range(runs):
             around = []
             for turn in range(OURS_AROUND):
@@ -144,9 +145,13 @@ def measure_others(sequence, camera, stacks, runs):
                     times.append(time.perf_counter() - begin)
                 decoder = pmp.PmpDecoder(sequence, camera)
                 around.append(coordinates_time(decoder, stacks[(run + turn + 1) % STACKS]))
+            ours += around
             ratios.append(times[-1] / np.median(around))
         low, middle, high = np.percentile(ratios, (25, 50, 75))
-        print(f"{name:30s}{1e3 * np.median(times):8.1f}   {middle:5.1f} x ours ({low:.1f} to {high:.1f})")
+        print(
+            f"{name:30s}{1e3 * np.median(times):8.1f} ({1e3 * min(times):.1f})   {middle:5.1f} x ours "
+            f"({low:.1f} to {high:.1f}; least times {min(times) / min(ours):.1f})"
+        )
 
 
 def coordinates_of(sequence, camera, frames):
