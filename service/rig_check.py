@@ -1,7 +1,7 @@
 """What of a rig file can be judged without opening a device, beyond its keys: options, modes, calibration, marks.
 
 Each driver judges its own options, and the simulated ones their rigs and scenes too. What only a device can say (is it
-there, does it have that pixel format) is `fringed doctor --rig FILE`'s to find.
+there, does it have that pixel format) is `fringed doctor FILE`'s to find.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ def check_config(
 ) -> int:
     """Check a rig file: keys, values, drivers and their options, scenes, modes, calibration. Opens no device.
 
-    All problems are named at once. What only a device can say, fringed doctor --rig FILE finds.
+    All problems are named at once. What only a device can say, fringed doctor FILE finds.
 
     \b
     Examples:
