@@ -9,24 +9,12 @@ import typer
 
 from service.commands.options import (
     AsJson,
-    AxisOption,
-    Bits,
-    Carriers,
-    Code,
-    Codes,
-    First,
     Force,
-    Frequencies,
-    Inverse,
-    Levels,
     Method,
     PatternOptions,
-    Profile,
-    Shifts,
-    Unmodulated,
-    White,
     output_path,
 )
+from service.commands.pattern_options import UNSAID, takes_pattern
 from service.terminal import print_facts, print_json, progress_lines
 
 if TYPE_CHECKING:
@@ -39,6 +27,7 @@ PATTERN_FILE = "pattern.json"
 DEFAULT_SIZE = "1152x864"
 
 
+@takes_pattern
 def patterns(
     method: Annotated[Method, typer.Argument(metavar="METHOD", help="pmp, mcp, gray, gray+pmp or cp.")],
     output: Annotated[
@@ -51,19 +40,7 @@ def patterns(
         str | None,
         typer.Option("--for", metavar="RIG", help="Choose for this rig (a file, or simulated[:SCENE]), and say why."),
     ] = None,
-    frequencies: Frequencies = None,
-    shifts: Shifts = None,
-    axis: AxisOption = None,
-    bits: Bits = None,
-    carriers: Carriers = None,
-    profile: Profile = None,
-    levels: Levels = None,
-    codes: Codes = None,
-    first: First = None,
-    unmodulated: Unmodulated = None,
-    white: White = False,
-    code: Code = None,
-    inverse: Inverse = None,
+    pattern: PatternOptions = UNSAID,
     gamma: Annotated[
         float | None,
         typer.Option(
@@ -95,22 +72,7 @@ def patterns(
     from scanner.storage import prepare_output, replace_json  # noqa: PLC0415
     from service.rig_patterns import known_rig  # noqa: PLC0415
 
-    said = PatternOptions(
-        frequencies,
-        shifts,
-        axis,
-        bits,
-        carriers,
-        profile,
-        levels,
-        white or None,
-        codes,
-        first,
-        unmodulated,
-        code,
-        inverse,
-    )
-    members = said.members(method)
+    members = pattern.members(method)
     if rig is not None and size is not None:
         raise typer.BadParameter("--size and --for exclude each other: the rig has a size")
     try:

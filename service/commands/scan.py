@@ -16,32 +16,20 @@ import typer
 
 from service.commands.options import (
     AsJson,
-    AxisOption,
-    Bits,
     Box,
-    Carriers,
-    Code,
-    Codes,
     Connect,
     DecoderName,
     Depth,
     EdgeFilter,
     Exposure,
-    First,
     Force,
-    Frequencies,
-    Inverse,
-    Levels,
     Method,
     MinConfidence,
     OutputFolder,
     PatternOptions,
-    Profile,
-    Shifts,
-    Unmodulated,
-    White,
     filter_members,
 )
+from service.commands.pattern_options import UNSAID, takes_pattern
 from service.commands.summary import report_result
 from service.terminal import ProgressLines, progress_lines
 
@@ -57,6 +45,7 @@ CANCEL_S = 5.0
 """How long an interrupted command waits to hear that its scan has stopped"""
 
 
+@takes_pattern
 def scan(
     rig: Annotated[
         str | None,
@@ -72,19 +61,7 @@ def scan(
     output: OutputFolder = None,
     connect: Connect = None,
     exposure: Exposure = None,
-    frequencies: Frequencies = None,
-    shifts: Shifts = None,
-    axis: AxisOption = None,
-    bits: Bits = None,
-    carriers: Carriers = None,
-    profile: Profile = None,
-    levels: Levels = None,
-    codes: Codes = None,
-    first: First = None,
-    unmodulated: Unmodulated = None,
-    white: White = False,
-    code: Code = None,
-    inverse: Inverse = None,
+    pattern: PatternOptions = UNSAID,
     repeat: Annotated[
         int,
         typer.Option(
@@ -119,22 +96,7 @@ def scan(
     """
     if rig is not None and connect is not None:
         raise typer.BadParameter("--rig and --connect exclude each other: a running daemon has a rig of its own")
-    said = PatternOptions(
-        frequencies,
-        shifts,
-        axis,
-        bits,
-        carriers,
-        profile,
-        levels,
-        white or None,
-        codes,
-        first,
-        unmodulated,
-        code,
-        inverse,
-    )
-    members = said.members(method)
+    members = pattern.members(method)
     params: dict[str, Any] = {
         "pattern": members or None,
         "exposure": None if exposure is None else exposure_given(exposure),
