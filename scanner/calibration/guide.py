@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.calibration.sight import SIDES, Sight, Standing, guessed_matrix, standing_of
+from scanner.calibration.sight import SIDES, Sight, Standing, matrix_of_poses, standing_of
 from scanner.calibration.targets import Target
 
 Array = NDArray[np.float64]
@@ -55,7 +55,8 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Guide:
-    """The poses so far. size: (width, height) px of the camera's picture; matrix: (3, 3), guessed until solved."""
+    """The poses so far. size: (width, height) px of the camera's picture; matrix: (3, 3), None until
+    it is solved."""
 
     target: Target
     size: tuple[int, int]
@@ -65,12 +66,15 @@ class Guide:
     @property
     def lens(self) -> Array:
         """The camera as far as it is known."""
-        return guessed_matrix(self.size) if self.matrix is None else self.matrix
+        if self.matrix is not None:
+            return self.matrix
+        return matrix_of_poses(self.target, [(pose.ids, pose.points) for pose in self.poses], self.size)
 
     @property
     def standings(self) -> list[Standing]:
         """How each pose stands."""
-        return [standing_of(self.target, pose.ids, pose.points, self.lens) for pose in self.poses]
+        lens = self.lens
+        return [standing_of(self.target, pose.ids, pose.points, lens) for pose in self.poses]
 
     def with_pose(self, pose: Seen) -> Guide:
         """One pose more."""

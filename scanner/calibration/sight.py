@@ -5,6 +5,7 @@ For guiding a hand: quick, and to a degree and a per cent. What is measured come
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,10 @@ Array = NDArray[np.float64]
 GUESSED_FOCAL = 1.5
 """Focal length over the picture's width, before anything is known: 37 degrees across. Tilts are told to a few degrees
 with one that is off by a half, and depths in shares not at all otherwise."""
+FOCALS = (0.4, 8.0)
+"""Focal lengths over the picture's width that a pose is believed to tell: 103 to 7 degrees across"""
+TELLING_TILT_DEG = 12.0
+"""From here, with a guessed focal length, a pose tells the true one; below, its perspective is the noise's"""
 MOST_TILT_DEG = 45.0
 """Beyond, squares are seen at less than .7 of their width, and fringes as coarse again are laid over each pixel."""
 DARK_SHARE = 0.25
@@ -60,6 +65,44 @@ def guessed_matrix(size: tuple[int, int]) -> Array:
     """(3, 3): a camera of which only the picture's size (width, height) is known."""
     focal = GUESSED_FOCAL * size[0]
     return np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1]])
+
+
+def matrix_of_poses(target: Target, poses: Sequence[tuple[NDArray[np.int64], Array]], size: tuple[int, int]) -> Array:
+    """(3, 3): the camera as far as tilted poses tell its focal length, before a rig can be solved.
+
+    By the two conditions that a plane's homography sets each view (Z. Zhang, *IEEE Transactions on Pattern Analysis
+    and Machine Intelligence* 22, 2000, sec. 3.1), principal point in the middle, pixels square.
+
+    Args:
+        poses: ids (N,) and points (N, 2) camera px of each.
+        size: (width, height) px of the picture.
+
+    Returns:
+        `guessed_matrix` where no pose is tilted enough.
+    """
+    guess = guessed_matrix(size)
+    telling = [one for one in poses if standing_of(target, *one, guess).tilt_deg >= TELLING_TILT_DEG]
+    if not telling:
+        return guess
+    middle = guess[:2, 2]
+    known, unknown = np.concatenate([_conditions(target.points[ids, :2], at - middle) for ids, at in telling], axis=1)
+    # Least squares for 1 / focal^2.
+    inverse = -float(unknown @ known) / float(unknown @ unknown)
+    focal = inverse**-0.5 if inverse > 0 else 0.0
+    if not FOCALS[0] * size[0] < focal < FOCALS[1] * size[0]:
+        return guess
+    return np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]])
+
+
+def _conditions(on_target: Array, seen: Array) -> tuple[Array, Array]:
+    """known, unknown: (2,) each, with known + unknown / focal^2 = 0: columns of a rotation are orthogonal, and as long
+    as one another. on_target: (N, 2) mm; seen: (N, 2) px from the principal point.
+    """
+    h = np.asarray(cv2.findHomography(on_target, seen)[0], dtype=np.float64)
+    h /= np.linalg.norm(h[:2, :2])
+    known = np.array([h[2, 0] * h[2, 1], h[2, 0] ** 2 - h[2, 1] ** 2])
+    unknown = np.array([h[:2, 0] @ h[:2, 1], h[:2, 0] @ h[:2, 0] - h[:2, 1] @ h[:2, 1]])
+    return known, unknown
 
 
 def standing_of(target: Target, ids: NDArray[np.int64], points: Array, matrix: Array) -> Standing:

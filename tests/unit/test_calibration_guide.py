@@ -54,6 +54,24 @@ def test_the_nearer_side_is_named_with_a_known_lens_and_with_a_guessed_one(
     assert standing.tilt_deg == pytest.approx(np.degrees(0.4), abs=3.0)
 
 
+@pytest.mark.parametrize("share", [0.8, 1.5, 3.0])
+@pytest.mark.parametrize("turn", [(0.35, 0.0), (0.0, -0.5), (0.25, 0.25)])
+def test_one_tilted_pose_tells_the_focal_length_and_so_its_tilt(share: float, turn: tuple[float, float]) -> None:
+    focal, middle = share * CAMERA_SIZE[0], np.array(CAMERA_SIZE) / 2 + (6, -4)
+    rotation = cv2.Rodrigues(np.array([*turn, 0.1]))[0]
+    in_camera = (TARGET.points - TARGET.points.mean(axis=0)) @ rotation.T + (20, 10, 600 * share)
+    noise = np.random.default_rng(1).normal(0, 0.05, (len(in_camera), 2))
+    points = focal * in_camera[:, :2] / in_camera[:, 2:] + middle + noise
+    guide = Guide(TARGET, CAMERA_SIZE, (Seen("pose", np.arange(len(points)), points),))
+    assert guide.lens[0, 0] == pytest.approx(focal, rel=0.06)
+    assert guide.standings[0].tilt_deg == pytest.approx(np.degrees(np.arccos(rotation[2, 2])), abs=0.5)
+
+
+def test_poses_that_face_the_camera_leave_the_focal_length_guessed() -> None:
+    guide = Guide(TARGET, CAMERA_SIZE, (seen(), seen((0.1, 0.0))))
+    np.testing.assert_array_equal(guide.lens, guessed_matrix(CAMERA_SIZE))
+
+
 def test_depths_are_in_proportion_whatever_the_focal_length() -> None:
     guessed = guessed_matrix(CAMERA_SIZE)
     near, far = (standing_of(TARGET, p.ids, p.points, guessed) for p in (seen(), seen(at=(0, 0, 840))))
