@@ -56,6 +56,14 @@ class Region:
     """decided / lit"""
     point_coverage: float
     """points / lit"""
+    too_dark: int
+    """of these, without a value since the pattern does not show there"""
+    too_dark_share: float
+    """too_dark / lit"""
+    undecided: int
+    """of these, without a value where the pattern shows"""
+    undecided_share: float
+    """undecided / lit"""
     wrong: int
     """decided pixels off by more than half the finest period, or 20 mm"""
     wrong_share: float
@@ -123,19 +131,24 @@ def compare(scan: Scan, truth: Truth, period_px: float | None = None) -> Compari
     for error in (rows, columns):
         if period_px is not None and error is not None:
             wrong |= np.abs(error) > period_px / 2
-    decided = scan.decoded
+    decided, shows = scan.decoded, scan.lit
     lit = truth.lit & np.isfinite(truth.xyz[..., 2])
     there = ~np.isnan(scan.xyz[..., 2]) if scan.xyz is not None else np.zeros_like(decided)
 
     def region(where: Mask) -> Region:
         pixels, values = int(where.sum()), int((where & decided).sum())
         points, off = int((where & there).sum()), int((where & decided & wrong).sum())
+        dark, open_ = int((where & ~shows).sum()), int((where & shows & ~decided).sum())
         return Region(
             lit=pixels,
             decided=values,
             points=points,
             coverage=values / max(pixels, 1),
             point_coverage=points / max(pixels, 1),
+            too_dark=dark,
+            too_dark_share=dark / max(pixels, 1),
+            undecided=open_,
+            undecided_share=open_ / max(pixels, 1),
             wrong=off,
             wrong_share=off / max(values, 1),
             depth_mm=_errors(depth, where),

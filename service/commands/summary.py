@@ -52,11 +52,7 @@ def report_result(folder: Path, seconds: float, stages: Mapping[str, float], *, 
 
 def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     facts = _frames(report.get("capture") or {})
-    coverage = report.get("coverage") or {}
-    if (lit := coverage.get("lit")) is not None:
-        kept = coverage.get("points_of_lit") if report.get("depth_mm") or report.get("removed") else None
-        points = f", {kept:.1%} keep a point" if kept is not None and round(kept, 3) != round(lit, 3) else ""
-        facts.append(("coverage", f"{lit:.1%} of the pixels in which the pattern shows{points}"))
+    facts += _coverage(report)
     exposure = (report.get("capture") or {}).get("exposure") or {}
     if (used := exposure.get("used_us")) is not None:
         facts.append(("exposure", f"{used / 1000:.3f} ms{', chosen by test shots' * (exposure.get('mode') == 'auto')}"))
@@ -78,6 +74,27 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         more = f"; {everywhere:,} with those at edges" if everywhere not in (None, wrong) else ""
         facts.append(("wrong", f"{wrong:,} points off by half a fringe or stripe, or by 20 mm{more}"))
     return facts
+
+
+def _coverage(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """How much has a value, of what; and how much is too dark to have one. Of all that is lit where truth tells it."""
+    coverage = report.get("coverage") or {}
+    if (shown := coverage.get("lit")) is None:
+        return []
+    kept = coverage.get("points_of_lit") if report.get("depth_mm") or report.get("removed") else None
+    points = f", {kept:.1%} keep a point" if kept is not None and round(kept, 3) != round(shown, 3) else ""
+    of_shown = ("coverage", f"{shown:.1%} of the pixels in which the pattern shows{points}")
+    truth = (report.get("truth") or {}).get("lit") or {}
+    if "too_dark_share" in truth:
+        whole = (
+            f"{truth['coverage']:.1%} of all that the projector lights (truth); {truth['too_dark_share']:.1%} of it is "
+            f"too dark to show the pattern, {truth['undecided_share']:.1%} undecided"
+        )
+        return [("coverage", whole), ("", of_shown[1])]
+    if not (dark := coverage.get("too_dark")):
+        return [of_shown]
+    words = f"{dark:.1%} of the image shows no pattern: shadow, a surface that is too dark, or none"
+    return [of_shown, ("too dark", words)]
 
 
 def _frames(capture: Mapping[str, Any]) -> list[tuple[str, str]]:

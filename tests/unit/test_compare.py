@@ -41,11 +41,13 @@ def test_figures_of_a_known_error(ball, scan):
     reason = scan.reason.copy()
     rows[50, 60:70] = np.nan
     xyz[50, 60:70] = np.nan
-    reason[50, 60:70] = 3
+    reason[50, 60:67], reason[50, 67:70] = 3, 4
     found = compare(replace(scan, xyz=xyz, rows=rows, reason=reason), ball.truth, period_px=10)
     assert found.lit.decided == ball.lit.sum() - 10
     assert found.lit.wrong == 2
     assert found.undecided.sum() == 10
+    assert (found.lit.too_dark, found.lit.undecided) == (7, 3)
+    assert found.lit.coverage + found.lit.too_dark_share + found.lit.undecided_share == pytest.approx(1)
     assert found.lit.depth_mm.median == pytest.approx(0.5, abs=1e-3)
     n = found.lit.depth_mm.count
     assert found.lit.depth_mm.rms == pytest.approx(np.sqrt(0.25 + (30.5**2 - 0.25) / n), rel=1e-3)

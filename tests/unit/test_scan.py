@@ -48,6 +48,8 @@ def test_counts_of_the_report_add_up(ball, scan):
     assert report["counts"]["pixels"] == 240 * 320 == sum(report["counts"]["reasons"].values())
     assert report["counts"]["lit"] == ball.lit.sum()
     assert report["coverage"]["lit"] == scan.coverage == 1.0
+    assert report["coverage"]["undecided_of_lit"] == 0
+    assert report["coverage"]["too_dark"] == pytest.approx(1 - ball.lit.mean())
     assert report["coverage"]["points_of_lit"] == pytest.approx(report["points"] / ball.lit.sum())
     assert {"triangulate", "filter"} <= report["timings"].keys()
     assert report["versions"]["numpy"] == np.__version__

@@ -55,6 +55,18 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "0 points off by half a fringe or stripe, or by 20 mm; 12 with those at edges" in printed
 
 
+@pytest.mark.parametrize("known", [False, True])
+def test_coverage_says_what_was_too_dark(known: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth = {"lit": {"coverage": 0.103, "too_dark_share": 0.896, "undecided_share": 0.001, "wrong": 0}}
+    report = {"points": 9, "coverage": {"lit": 0.992, "points_of_lit": 0.992, "too_dark": 0.901}}
+    (tmp_path / "report.json").write_text(json.dumps(report | ({"truth": truth} if known else {})), encoding="utf-8")
+    report_result(tmp_path, 1.0, {}, as_json=False)
+    printed = capsys.readouterr().out
+    assert "99.2% of the pixels in which the pattern shows" in printed
+    assert ("10.3% of all that the projector lights (truth); 89.6% of it is too dark" in printed) == known
+    assert ("90.1% of the image shows no pattern" in printed) != known
+
+
 def test_what_a_method_adds_unknown_gets_no_figure_of_the_whole(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
