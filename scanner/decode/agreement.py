@@ -28,6 +28,10 @@ MIN_AGREEMENT = 0.3
 PAIR_DISTANCE = 2
 """Camera pixels between the two of a pair: near enough to share what is systematic, too far to share a blur's noise."""
 
+MOST_SYSTEMATIC = 0.1
+"""Of a fringe, sigma over the image, by which neighbouring rungs may differ beyond noise before it is said: half a
+fringe, from which on the next one is counted, is then five sigmas away, and such errors have longer tails than noise"""
+
 _NOISE_BINS = 8
 _UNFOLDED_SIGMA = 0.15
 """Predicted sigma of a pair's difference, cycles, up to which it stays within half a cycle (3.3 sigma)."""
@@ -93,6 +97,27 @@ def disagreements(axis: str, remainders: Sequence[Remainder]) -> tuple[str, ...]
         for r in remainders
         if r.pixels >= MIN_PIXELS and r.expected_sigma < _UNFOLDED_SIGMA and r.agreement < MIN_AGREEMENT
     )
+
+
+def doubtful_counts(axis: str, remainders: Sequence[Remainder]) -> tuple[str, ...]:
+    """What a user should know about steps that count fringes of the finer rung by a coarser one that is out of true.
+
+    Pixels near half a fringe are undecided; those beyond it look as sound as those on their fringe.
+    """
+    return tuple(
+        f"frequencies {r.low:g} and {r.high:g} along {axis} differ by {beyond:.2f} fringes of the finer one more than "
+        "noise explains: where that reaches half a fringe the next one is counted. Light that surfaces throw at one "
+        "another, in hollows, does this to wide fringes first: take frequencies without a low one (59, 64, 70), or "
+        "gray+pmp"
+        for r, beyond in ((r, _beyond_noise(r)) for r in remainders if r.pixels >= MIN_PIXELS)
+        if beyond > MOST_SYSTEMATIC and r.agreement >= MIN_AGREEMENT
+    )
+
+
+def _beyond_noise(remainder: Remainder) -> float:
+    """Sigma over the whole image, cycles, from the mean vector's length (Mardia 1972, sec. 3.4), without noise's."""
+    spread2 = -2 * np.log(max(remainder.agreement, 1e-6)) / (2 * np.pi) ** 2
+    return float(np.sqrt(max(spread2 - remainder.expected_sigma**2, 0.0)))
 
 
 def noise_of_pairs(

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Coordinates, Decoded, Reason, neighbours
-from scanner.decode.agreement import disagreements
+from scanner.decode.agreement import disagreements, doubtful_counts
 from scanner.decode.frames import FrameCheck
 from scanner.decode.lone_set import require_fringes
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps
@@ -107,7 +107,7 @@ class PmpDecoder:
                 self._decode(axis)
         for axis, found in self._found.items():
             self._require_fringes(axis, found)
-            warnings += disagreements(axis, found.remainders)
+            warnings += disagreements(axis, found.remainders) + doubtful_counts(axis, found.remainders)
             if (changes := found.light.flicker) is not None:
                 warnings += tuple(filter(None, [changes.warning(axis, found.random_px)]))
             if found.ripple is not None and (ripple := found.ripple.warning(axis, found.light)) is not None:

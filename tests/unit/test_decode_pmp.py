@@ -541,3 +541,19 @@ def test_noise_is_no_fringe_where_nothing_contradicts_it(brief):
     # Noise of a fiftieth of a cycle, and the seam of the period, are fringes all the same.
     noisy = decode(sequence.pattern, render(sequence.pattern, noise=12.0))
     assert np.isfinite(noisy.rows).mean() > 0.5
+
+
+@pytest.mark.parametrize(("most", "warned"), [(0.09, True), (0.01, False)])
+def test_wide_fringes_that_light_from_elsewhere_has_moved_are_told(most, warned):
+    # A hollow throws light at itself: the one-cycle set's phase moves by up to `most` cycles, finer ones stay.
+    rows, columns = surface()
+    hollow = most * np.exp(-(np.linspace(-3, 3, CAMERA.width) ** 2))[None, :] * PROJECTOR.height
+    frames = render(FRINGES, noise=1)
+    frames[:4] = render(FRINGES, noise=1, shape=(rows + hollow, columns))[:4]
+    decoded = decode(FRINGES, frames)
+    told = [said for said in decoded.warnings if "the next one is counted" in said]
+    assert len(told) == warned
+    if warned:
+        assert "frequencies 1 and 8 along y" in told[0]
+        # Half a fringe of eight is a sixteenth of a cycle: between there and three times as much nothing shows it.
+        assert np.mean(np.abs(decoded.rows - rows)[np.isfinite(decoded.rows)] > 15) > 0.02
