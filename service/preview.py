@@ -34,6 +34,9 @@ LIT_NS = 300_000_000
 UNWATCHED_NS = 10_000_000_000
 """Without a subscriber for so long the projector goes black and the camera rests, until there is one again: who asked
 for the preview may have been killed, and lamps do not last for ever."""
+MOST_TRIES = 6
+"""Pictures that may pass until the exposure suits the scene, or cannot: three at 4 times more cover a factor of 64"""
+
 LONGEST_NS = 200_000_000
 """Exposure that a preview goes to by itself: five pictures a second, also of a dark view."""
 
@@ -59,6 +62,8 @@ class Previewer:
         self._watched_ns = clock.now_ns()
         self.resting = False
         """nobody watches"""
+        self._tried = 0
+        """pictures of the light, of which none is shown before the exposure suits it or MOST_TRIES are over"""
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.SNDHWM, 2)
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
@@ -92,23 +97,32 @@ class Previewer:
         pixels = frame.pixels
         stride = -(-pixels.shape[1] // self._max_width)
         small = np.ascontiguousarray(pixels[::stride, ::stride])
+        if frame.exposure.start_ns <= self._lit_ns:
+            return  # of light that is on its way: as good as any in brightness, and no measure of sharpness
+        better = None
+        if self._adapts:
+            taken_ns = frame.exposure.end_ns - frame.exposure.start_ns
+            better = better_exposure(small, taken_ns, camera.capabilities)
+        self._tried += 1
+        if better is None or self._tried > MOST_TRIES:
+            self._tried = MOST_TRIES
+            self._publish(small, frame.exposure.start_ns, stride)
+        if better is not None:
+            self._exposure_ns = better
+            camera.stop()  # the pixels were the camera's until here
+            self._start()
+
+    def _publish(self, small: NDArray[Any], t_ns: int, stride: int) -> None:
         header = PreviewHeader(
             number=next(self._numbers),
             width=small.shape[1],
             height=small.shape[0],
             dtype="uint8" if small.dtype == np.uint8 else "uint16",
-            t_ns=frame.exposure.start_ns,
+            t_ns=t_ns,
             stride=stride,
         )
         with suppress(zmq.Again):
             self._socket.send(encode_image(header, small.data.cast("B")), zmq.DONTWAIT)
-        if self._adapts and frame.exposure.start_ns > self._lit_ns:
-            taken_ns = frame.exposure.end_ns - frame.exposure.start_ns
-            better = better_exposure(small, taken_ns, camera.capabilities)
-            if better is not None:
-                self._exposure_ns = better
-                camera.stop()  # the pixels were the camera's until here
-                self._start()
 
     def _is_watched(self) -> bool:
         """Whether somebody has subscribed, or had of late; when they are gone the light is put out."""
@@ -156,6 +170,7 @@ class Previewer:
         modes = camera.capabilities.trigger_modes
         self._mode = TriggerMode.SOFTWARE if TriggerMode.SOFTWARE in modes else TriggerMode.FREE
         self._lit_ns = self._clock.now_ns() + LIT_NS
+        self._tried = 0
         self._start()
         self._running = True
 

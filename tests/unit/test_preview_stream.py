@@ -48,6 +48,12 @@ def test_pictures_find_their_own_exposure(scale: float, tmp_path: Path) -> None:
     assert levels[-1] == pytest.approx(levels[-2], abs=0.03)  # found, and left alone
 
 
+@pytest.mark.parametrize("scale", [12.0, 0.1])
+def test_the_first_picture_is_lit_and_exposed_like_those_after_it(scale: float, tmp_path: Path) -> None:
+    levels = shown(f"quick/board?exposure_scale={scale}", tmp_path, "auto", 3)
+    assert levels == pytest.approx([levels[-1]] * 3, abs=0.03)  # figures of others are no measure: "best" would stay
+
+
 def test_a_rig_files_exposure_is_kept(tmp_path: Path) -> None:
     levels = shown("quick/board?exposure_scale=12", tmp_path, 2000.0, 14)
     assert levels[-2:] == pytest.approx([230 / 255 * 12 * 2 / 33.333] * 2, abs=0.05)
