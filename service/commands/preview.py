@@ -50,7 +50,7 @@ def preview(
 
     \b
     mean       of all pixels, share of the camera's range
-    bright     grey level that one pixel in 200 exceeds, share of the range; scans expose for 85% of it
+    bright     grey level that one pixel in 200 exceeds, share of the range; scans expose for at most 95% of it
     saturated  share of the pixels at the top of the range, where it is more than 1 in 1000
     sharpness  100 x rms slope of the picture over its mean level, noise taken off; without a unit, and good only for
                comparing one focus with another in the same view. best: the largest so far
