@@ -1,7 +1,7 @@
 """Frames to projector rows: the contract of every decoder, and the one that fits a pattern.
 
 A decoder is given frames one at a time, in any order, as they arrive; what is left to do after the last one is
-small. It knows the pattern and the camera's format, and neither devices nor calibration.
+small. It knows the pattern and the camera's format, and no devices; it may be told the calibration.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from scanner.decode.stages import Observer
 from scanner.errors import DecodeError
+from scanner.geometry import Calibration
 from scanner.patterns import (
     CameraFormat,
     CompositePattern,
@@ -153,6 +154,7 @@ def decoder_for(
     name: str = "default",
     observer: Observer | None = None,
     mcp_phase: Mapping[str, Any] | None = None,
+    calibration: Calibration | None = None,
 ) -> Decoder:
     """The decoder for a pattern.
 
@@ -162,6 +164,7 @@ def decoder_for(
         name: "default", or a decoder of that method by name: "casey2011" for MCP, the dissertation's own.
         observer: told the intermediate images, if one is given.
         mcp_phase: a calibration's code-to-phase fit, if it has one. "casey2011" alone uses it: others know the rows.
+        calibration: the rig's, if it has one. No decoder needs it, and none uses it so far.
 
     Raises:
         DecodeError: no such decoder for this method, or one that has no stages for the observer.
