@@ -9,11 +9,11 @@ import numpy as np
 from scanner.calibration.grey_levels import LEVELS, LevelResponse, response_of_levels
 from scanner.clock import Clock
 from scanner.devices import ProjectorKind
-from scanner.errors import ConfigError
+from scanner.errors import CalibrationError, ConfigError
 from scanner.sequencer.light import fitting_exposure
 from scanner.sequencer.shots import Shots
 from service.config import RigConfig
-from service.scan_setup import open_rig
+from service.scan_setup import OpenRig, open_rig
 
 
 def measure_response(config: RigConfig, clock: Clock, stage: Callable[[str], None]) -> LevelResponse:
@@ -27,24 +27,49 @@ def measure_response(config: RigConfig, clock: Clock, stage: Callable[[str], Non
     stage("opening devices")
     opened = open_rig(config.model_dump(mode="json"), clock)
     try:
-        rig = opened.rig
-        capabilities = rig.projector.capabilities
-        if capabilities.kind is not ProjectorKind.FRAMEBUFFER:
-            raise ConfigError(
-                f"a {capabilities.kind.value} projector is not flipped by the host, and shows no levels one by one",
-                device=rig.projector.name,
-                hint="show them by other means, and give the images: fringed calibrate response FOLDER --levels ...",
-            )
-        with Shots(
-            rig.projector, rig.camera, clock, settings=rig.settings, trigger_mode=rig.trigger_mode
-        ) as shots:  # fmt: skip
-            stage("choosing the exposure")
-            fitting_exposure(shots, capabilities.refresh_ns)
-            rig.projector.load([np.full((capabilities.height, capabilities.width), v, np.uint8) for v in LEVELS])
-            shots.images = len(LEVELS)
-            stage("measuring levels")
-            order = [*range(len(LEVELS)), *reversed(range(len(LEVELS)))]
-            frames = [shots.steady(i).pixels for i in order]
-        return response_of_levels([LEVELS[i] for i in order], frames, rig.camera.capabilities.max_value)
+        return _measured(opened, clock, stage)
     finally:
         opened.close()
+
+
+def first_response(config: RigConfig, clock: Clock, stage: Callable[[str], None]) -> tuple[LevelResponse | None, str]:
+    """The response that a calibration begins with, and what to say of it.
+
+    Returns:
+        None for a rig whose calibration has one, and where nothing in view tells it: a pose's fringes have to.
+
+    Raises:
+        DeviceError: a device cannot be opened, or failed.
+    """
+    stage("opening devices")
+    opened = open_rig(config.model_dump(mode="json"), clock)
+    try:
+        if opened.known.precorrection is not None:
+            return None, "response: undone as the rig's calibration has it"
+        found = _measured(opened, clock, stage)
+    except (CalibrationError, ConfigError) as error:
+        return None, f"response: not told by grey levels ({error}); the first pose's fringes will"
+    finally:
+        opened.close()
+    words = f"gamma {found.gamma:.3f} +- {found.sigma:.3f}" if "gamma" in found.response else "a table"
+    return found, f"response: {words}, by {len(found.levels)} grey levels on what is in view; scans will undo it"
+
+
+def _measured(opened: OpenRig, clock: Clock, stage: Callable[[str], None]) -> LevelResponse:
+    rig = opened.rig
+    capabilities = rig.projector.capabilities
+    if capabilities.kind is not ProjectorKind.FRAMEBUFFER:
+        raise ConfigError(
+            f"a {capabilities.kind.value} projector is not flipped by the host, and shows no levels one by one",
+            device=rig.projector.name,
+            hint="show them by other means, and give the images: fringed calibrate response FOLDER --levels ...",
+        )
+    with Shots(rig.projector, rig.camera, clock, settings=rig.settings, trigger_mode=rig.trigger_mode) as shots:
+        stage("choosing the exposure")
+        fitting_exposure(shots, capabilities.refresh_ns)
+        rig.projector.load([np.full((capabilities.height, capabilities.width), v, np.uint8) for v in LEVELS])
+        shots.images = len(LEVELS)
+        stage("measuring levels")
+        order = [*range(len(LEVELS)), *reversed(range(len(LEVELS)))]
+        frames = [shots.steady(i).pixels for i in order]
+    return response_of_levels([LEVELS[i] for i in order], frames, rig.camera.capabilities.max_value)

@@ -31,6 +31,7 @@ from service.commands.options import AsJson, Connect, output_path
 from service.terminal import progress_lines
 
 if TYPE_CHECKING:
+    from scanner.calibration.grey_levels import LevelResponse
     from scanner.calibration.solve import Solution, SolveOptions
     from scanner.calibration.targets import Target
     from service.config import RigConfig
@@ -46,6 +47,8 @@ SEE_S = 0.2
 """A key is looked for this often."""
 GAMMA_OFF = 0.02
 """Exponent's distance from 1 from which it is kept for projection: below, 8-bit projection leaves as much ripple."""
+LEVELS_DIFFER = 0.1
+"""Share by which the fringes' exponent and the grey levels' may differ unsaid: blur takes so much from overtones."""
 
 
 def run(
@@ -145,13 +148,13 @@ def _guided(
     from service.guided_calibration import GuidedCalibration  # noqa: PLC0415
     from service.keys import keys  # noqa: PLC0415
 
-    with _daemon(rig, connect) as endpoint, Client(endpoint, name="fringed calibrate run") as client:
+    with _daemon(rig, connect) as (endpoint, levels), Client(endpoint, name="fringed calibrate run") as client:
         session = GuidedCalibration(client, target, asked.folder, options)
         try:
             if taken_up := session.take_up():
                 say(f"{taken_up} poses of {asked.folder} are taken up")
             with keys() as pressed:
-                loop = _Loop(session, asked, pressed)
+                loop = _Loop(session, asked, pressed, levels)
                 loop.run()
             with progress_lines() as lines:
                 return session.solved(leave_out=True, progress=lines.stage), loop.response
@@ -164,18 +167,23 @@ def _guided(
 
 
 @contextmanager
-def _daemon(rig: str | None, connect: str | None) -> Iterator[str]:
-    """The daemon named, or a private one with this rig and its latency measured."""
+def _daemon(rig: str | None, connect: str | None) -> Iterator[tuple[str, LevelResponse | None]]:
+    """The daemon named, or a private one with this rig; its latency and its response are measured before."""
+    from scanner.clock import MonotonicClock  # noqa: PLC0415
     from service.config import load_rig  # noqa: PLC0415
     from service.private import private_daemon  # noqa: PLC0415
+    from service.response_measure import first_response  # noqa: PLC0415
 
     if rig is None:
         say("latency: as the daemon knows or measures it")
-        yield str(connect)
+        yield str(connect), None
         return
     config = _in_step(load_rig(rig))
+    with progress_lines() as lines:
+        levels, words = first_response(config, MonotonicClock(), lines.stage)
+    say(words)
     with private_daemon(config) as endpoint:
-        yield endpoint
+        yield endpoint, levels
 
 
 def _in_step(config: RigConfig) -> RigConfig:
@@ -202,7 +210,9 @@ def _in_step(config: RigConfig) -> RigConfig:
 class _Loop:
     """Preview, keys, captures, until there are enough poses or somebody ends it."""
 
-    def __init__(self, session: GuidedCalibration, asked: _Asked, keys: Keys) -> None:
+    def __init__(
+        self, session: GuidedCalibration, asked: _Asked, keys: Keys, levels: LevelResponse | None = None
+    ) -> None:
         from scanner.calibration.guide import Stillness  # noqa: PLC0415
 
         self._session, self._asked, self._keys = session, asked, keys
@@ -212,7 +222,8 @@ class _Loop:
         self._seen: Any = "no picture of the camera yet"
         self._progress_s = time.monotonic()
         self._told = False
-        self.response: dict[str, Any] | None = None
+        self._levels = levels
+        self.response: dict[str, Any] | None = None if levels is None else levels.response
         """the projector's, where scans should undo it"""
 
     def run(self) -> None:
@@ -270,9 +281,11 @@ class _Loop:
             self._say_next()
 
     def _tell_response(self) -> None:
-        """Once, from the first pose."""
+        """Once, from the first pose; where grey levels told it before, the fringes are a check."""
         if self._session.observations and not self._told:
-            self.response, self._told = _response(self._session), True
+            told, self._told = _response(self._session, self._levels), True
+            if self._levels is None:
+                self.response = told
 
     def _undo(self) -> None:
         name = self._session.undo()
@@ -305,21 +318,26 @@ def _frames(event: Any) -> None:
         draw_line("captured; decoding")
 
 
-def _response(session: GuidedCalibration) -> dict[str, Any] | None:
-    """The projector's gamma, told in words; as the calibration file has it where scans should undo it."""
+def _response(session: GuidedCalibration, levels: LevelResponse | None) -> dict[str, Any] | None:
+    """The projector's gamma by fringes, told in words; as the calibration file has it where scans should undo it."""
     from scanner.calibration.response import Response  # noqa: PLC0415
 
     found = session.response()
     if not isinstance(found, Response):
-        say(f"response: not told ({found})")
+        say(f"response: not told{'' if levels is None else ' a second time'} ({found})")
         return None
     off = abs(found.exponent - 1)
     real = off > max(3 * found.sigma, GAMMA_OFF) and found.gamma is not None
+    if levels is not None:
+        verdict = "the file has what grey levels told"
+    else:
+        verdict = f"scans will project with gamma {found.gamma:.3f}" if real else "nothing to correct"
     say(
         f"response: light follows what is projected to the power of {found.exponent:.3f} +- {found.sigma:.3f}; "
-        f"ripple {found.ripple_px:.3f} px; "
-        + (f"scans will project with gamma {found.gamma:.3f}" if real else "nothing to correct")
+        f"ripple {found.ripple_px:.3f} px; {verdict}"
     )
+    if levels is not None and abs(found.exponent - levels.gamma) > LEVELS_DIFFER * levels.gamma:
+        say(f"fringes and grey levels ({levels.gamma:.3f}) differ: fringes are blurred, or the response is no exponent")
     return {"gamma": found.gamma, "table": None} if real else None
 
 

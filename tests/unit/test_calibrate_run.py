@@ -12,13 +12,18 @@ import numpy as np
 import pytest
 
 from scanner import client as client_module
+from scanner.calibration.grey_levels import LevelResponse
 from scanner.calibration.guide import Guide, Seen
+from scanner.calibration.response import Response
 from scanner.calibration.sight import Sight, Standing
 from scanner.calibration.targets import parse_target
 from scanner.client import Client
+from scanner.clock import VirtualClock
 from scanner.errors import Unreachable
 from service.commands import calibrate_run
+from service.config import load_rig
 from service.keys import Keys, keys
+from service.response_measure import first_response
 from service.rig_file_edit import set_values
 from tests.unit.simulated_bench import Bench
 
@@ -174,3 +179,43 @@ def test_a_capture_of_which_nothing_is_heard_is_given_up(monkeypatch: pytest.Mon
         client.wait("one", lambda event: heard.append(event.kind), patience_s=20.0)
     assert heard == ["decoding"]
     assert len(asked) > 3
+
+
+def test_what_grey_levels_told_stays_and_the_first_pose_checks_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Told(Session):
+        def response(self) -> Response:
+            return Response(1.6, 0.01, 1.6, 0.4, 0.1, 0.01, 900)
+
+    levels = LevelResponse(2.2, 0.01, 0.002, (0.0, 1.0), (0, 128, 255), (0.0, 0.2, 1.0), 500)
+    asked = calibrate_run._Asked(tmp_path, tmp_path / "live.png", 3, False)
+    looped = calibrate_run._Loop(Told(sight_at(0)), asked, Pressed("  \nq"), levels)  # type: ignore[arg-type]
+    assert looped.response == {"gamma": 2.2}
+    looped.run()
+    assert looped.response == {"gamma": 2.2}
+    said = capsys.readouterr().err
+    assert "to the power of 1.600 +- 0.010; ripple 0.400 px; the file has what grey levels told" in said
+    assert "fringes and grey levels (2.200) differ" in said
+
+
+def test_the_response_is_measured_before_the_first_pose(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    file = tmp_path / "rig.toml"
+    file.write_text(
+        '[camera]\ndriver = "simulated"\ndevice = "quick/board"\n[projector]\ndriver = "simulated"\n'
+        'device = "quick/board"\n'
+    )
+    config, stages = load_rig(str(file)), list[str]()
+    assert first_response(config, VirtualClock(), stages.append) == (
+        None,
+        "response: undone as the rig's calibration has it",
+    )
+    unknown = SimpleNamespace(precorrection=None)
+    monkeypatch.setattr("service.scan_setup.OpenRig.known", unknown)
+    found, words = first_response(config, VirtualClock(), stages.append)
+    assert found is not None
+    assert found.gamma == pytest.approx(2.3, abs=0.03)
+    assert "grey levels on what is in view" in words
+    assert stages[-1] == "measuring levels"
+    monkeypatch.setattr("service.response_measure.LEVELS", (0, 255))
+    assert first_response(config, VirtualClock(), stages.append)[1].startswith("response: not told by grey levels (")
