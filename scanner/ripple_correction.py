@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Map
+from scanner.decode.ripples import FEWEST_SHIFTS_UNHARMED
 from scanner.errors import DecodeError
 from scanner.kernel import kernel
 from scanner.patterns import Axis, PatternSequence, PmpPattern
@@ -32,7 +33,8 @@ _TABLE = 1024
 def without_ripple(decoded: Decoded, sequence: PatternSequence) -> Decoded:
     """The same maps without the finest set's ripple, where it is told and certain; PMP only.
 
-    In `details`, the set's `ripple_px` becomes what may be left, and `corrected` is true.
+    In `details`, the set's `ripple_px` becomes what may be left, and `corrected` is true. Where nothing is taken off, a
+    warning says why.
 
     Raises:
         DecodeError: another method.
@@ -46,14 +48,13 @@ def without_ripple(decoded: Decoded, sequence: PatternSequence) -> Decoded:
     if not light:
         return decoded
     maps: dict[Axis, Map | None] = {"y": decoded.rows, "x": decoded.columns}
-    told = dict(light)
+    told, said = dict(light), list[str]()
     for axis in pattern.axes:
         harmonics = [dict(h) for h in light[axis]["harmonics"]]
         finest = max(range(len(harmonics)), key=lambda k: harmonics[k]["frequency"])
         found, values = harmonics[finest].get("ripple"), maps[axis]
-        if found is None or values is None:
-            continue
-        if np.hypot(found["cosine_px"], found["sine_px"]) < CERTAIN_SIGMAS * found["sigma_px"]:
+        if (idle := _nothing_to_correct(harmonics[finest])) is not None or found is None or values is None:
+            said.append(f"--correct-ripple took nothing off along {axis}: {idle}")
             continue
         straight = values.copy()
         per_px = harmonics[finest]["frequency"] / sequence.projector.along(axis)
@@ -61,7 +62,23 @@ def without_ripple(decoded: Decoded, sequence: PatternSequence) -> Decoded:
         maps[axis] = straight
         harmonics[finest] |= {"ripple_px": found["sigma_px"], "corrected": True}
         told[axis] = {**light[axis], "harmonics": harmonics}
-    return replace(decoded, rows=maps["y"], columns=maps["x"], details={**decoded.details, "light": told})
+    details = {**decoded.details, "light": told}
+    return replace(
+        decoded, rows=maps["y"], columns=maps["x"], details=details, warnings=(*decoded.warnings, *said)
+    )  # fmt: skip
+
+
+def _nothing_to_correct(finest: Mapping[str, Any]) -> str | None:
+    """Why; None where there is something."""
+    found = finest.get("ripple")
+    if finest["shifts"] >= FEWEST_SHIFTS_UNHARMED:
+        return f"with {finest['shifts']} shifts no overtone of a response passes for the fringe"
+    if found is None:
+        return "no other frequency, or too few pixels, to tell a ripple by"
+    height = float(np.hypot(found["cosine_px"], found["sine_px"]))
+    if height < CERTAIN_SIGMAS * found["sigma_px"]:
+        return f"its ripple of {height:.3f} projector px is not certain (1 sigma {found['sigma_px']:.3f} px)"
+    return None
 
 
 def widen_by_ripple(scan: Scan, sequence: PatternSequence, phase_axis: str) -> Scan:

@@ -26,6 +26,7 @@ from scanner.decode.pmp_light import Light, judge_light, judge_ripple
 from scanner.decode.pmp_sample import take_sample
 from scanner.decode.reasons import REASONS
 from scanner.decode.strips import in_strips
+from scanner.decode.torn_rows import LEAST_LIT, LEAST_SHARE, PARTS, leave_torn_rows_out
 from scanner.decode.unwrapping import Ladder, plan_ladder
 from scanner.patterns import CameraFormat
 from scanner.patterns.description import Axis
@@ -234,6 +235,13 @@ def decode_axis(
         settled = settle(maps.position, maps.sigma, maps.confidence, maps.reason, camera.width, per_px)
         counts[Reason.UNWRAP_RISK] -= settled
         counts[Reason.VALUE] += settled
+    if counts[Reason.MOVED] >= PARTS * LEAST_LIT * LEAST_SHARE:
+        shape = camera.shape
+        confidence, torn = maps.confidence.reshape(shape), maps.reason.reshape(shape)
+        changes = leave_torn_rows_out(torn, maps.position.reshape(shape), maps.sigma.reshape(shape), confidence)
+        if changes.any():
+            confidence[torn == Reason.OUT_OF_STEP] = 0
+            counts += changes
     return AxisFound(maps, ladder, noise, remainders, settled, ripple, light, random_px, counts)
 
 

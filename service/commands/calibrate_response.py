@@ -109,8 +109,19 @@ def _of_images(folder: Path, levels: str, lines: ProgressLines) -> LevelResponse
     paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in IMAGES)
     read = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) for path in paths]
     frames: list[Any] = [frame for frame in read if frame is not None]
-    if not frames or len(frames) != len(read) or len({(f.shape, f.dtype) for f in frames}) != 1:
-        raise CalibrationError(f"{folder}: no images, or some that cannot be read or differ in size or depth")
+    if not paths:
+        raise CalibrationError(
+            f"{folder} has no images", hint=f"one image a level, named in their order: {', '.join(sorted(IMAGES))}"
+        )
+    if len(frames) != len(read):
+        bad = ", ".join(path.name for path, frame in zip(paths, read, strict=True) if frame is None)
+        raise CalibrationError(f"{folder}: cannot read {bad}", hint="save these again, or take them again")
+    kinds = [f"{f.shape[1]} x {f.shape[0]} of {8 * f.dtype.itemsize} bits" for f in frames]
+    if odd := next((i for i, kind in enumerate(kinds) if kind != kinds[0]), None):
+        raise CalibrationError(
+            f"{folder}: {paths[0].name} is {kinds[0]}, {paths[odd].name} is {kinds[odd]}",
+            hint="take all levels with one camera, region and pixel format",
+        )
     # The range of more than 8 bits is not told by an image: the whole bits of what is brightest stand for it.
     top = 255 if frames[0].dtype.itemsize == 1 else (1 << max(int(max(f.max() for f in frames)).bit_length(), 9)) - 1
     return response_of_levels(values, frames, top)

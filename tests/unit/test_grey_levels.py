@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from scanner.calibration.grey_levels import LEVELS, response_of_levels
 from scanner.errors import CalibrationError
 from scanner.patterns.sequence import Precorrection
 from service.cli import main
+from service.commands import calibrate_response
 from service.rig_patterns import inverse_table
 
 SHAPE = (60, 80)
@@ -95,3 +97,18 @@ def test_the_command_reads_images_and_writes_into_a_calibration(tmp_path, capsys
     assert "one level for each frame" in capsys.readouterr().err
     assert main(["calibrate", "response", str(folder), "--levels", said]) == 0
     assert "gamma" in capsys.readouterr().out
+
+
+def test_a_folder_of_levels_says_which_image_is_at_fault(tmp_path):
+    def refused():
+        with pytest.raises(CalibrationError) as caught:
+            calibrate_response._of_images(tmp_path, "0,255", SimpleNamespace(stage=lambda words: None))
+        assert caught.value.hint
+        return str(caught.value)
+
+    assert "has no images" in refused()
+    for name, size in (("a.png", (8, 6)), ("b.png", (8, 6)), ("c.png", (9, 6))):
+        cv2.imwrite(str(tmp_path / name), np.zeros(size[::-1], np.uint8))
+    assert "a.png is 8 x 6 of 8 bits, c.png is 9 x 6 of 8 bits" in refused()
+    (tmp_path / "b.png").write_bytes(b"no image")
+    assert "cannot read b.png" in refused()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scanner.decode import decoder_for
+from scanner.decode import Reason, decoder_for
 from scanner.decode.agreement import remainders_of
 from scanner.decode.harmonics import height_weights, spectra_of
 from scanner.decode.pmp_frames import axis_frames
@@ -175,6 +175,10 @@ def test_a_ripple_can_be_taken_off(exponent):
     noise = float(np.nanmedian(found.sigma_rows))
     if exponent == 1.0:
         np.testing.assert_array_equal(straight.rows, found.rows)
+        assert "took nothing off along y: its ripple of 0.0" in straight.warnings[-1]
+        eight = decoded(PmpPattern(("y",), (1.0, 8.0), (8, 8)), shown(PmpPattern(("y",), (1.0, 8.0), (8, 8))))
+        idle = without_ripple(eight, PatternSequence(PROJECTOR, PmpPattern(("y",), (1.0, 8.0), (8, 8))))
+        assert "with 8 shifts no overtone" in idle.warnings[-1]
         return
     assert before > 1.8 * noise
     assert after < 1.1 * noise
@@ -223,3 +227,22 @@ def test_one_response_ripples_all_sets_alike_but_for_blur():
     assert [fit is None for fit in many] == [False, True, True]
     few = seen[:, :50]
     assert ripples(ladder, remainders_of(ladder, few, 0.5), few, heights, (3, 3, 3), (1, 8, 24), along) == [None] * 3
+
+
+def test_rows_whose_frames_contradict_one_another_from_side_to_side_are_out_of_step():
+    """A shutter that rolls into the next flip is wrong in whole rows; what moves has sides."""
+    pattern = PmpPattern(("y",), (1.0, 8.0, 24.0), (4, 4, 4))
+    frames = shown(pattern)
+    for k in (4, 8):
+        frames[k][40:60] = frames[k + 2][40:60]
+        frames[k][100:130, 60:110] = frames[k + 2][100:130, 60:110]
+    found = decoded(pattern, frames)
+    band, body = found.reason[40:60], found.reason[100:130, 60:110]
+    assert np.all(band == Reason.OUT_OF_STEP)
+    assert np.all(found.confidence[40:60] == 0)
+    assert np.all(np.isnan(found.sigma_rows[40:60]))
+    assert np.mean(body == Reason.MOVED) > 0.8
+    assert not np.any(np.delete(found.reason, np.s_[40:60], axis=0) == Reason.OUT_OF_STEP)
+    np.testing.assert_array_equal(found.reason == Reason.VALUE, np.isfinite(found.rows))
+    assert found.details["counts"]["out_of_step"] == band.size
+    assert sum(found.details["counts"].values()) == found.reason.size
