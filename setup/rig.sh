@@ -201,7 +201,7 @@ phase() {
         steady) # no bound on single tests: by the guest's clock waiting for the disk may take minutes
             say "drivers in time, by a clock that counts instructions"
             boot steady "${pytest[@]}" --timeout=0 tests/rig/test_steady*.py ;;
-        systemd) say "the service, under systemd"; boot systemd "${pytest[@]}" tests/rig/test_installed.py ;;
+        systemd) say "the service, under systemd"; boot systemd "${pytest[@]}" tests/rig/test_installed_projector.py tests/rig/test_installed.py ;;
     esac
 }
 

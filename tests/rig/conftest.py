@@ -15,6 +15,14 @@ LEFT_OUT = {None: ["test_*.py"], "fast": ["test_installed*.py", "test_steady*.py
 collect_ignore_glob = LEFT_OUT[MODE]
 
 
+@pytest.fixture(scope="session")
+def installed() -> None:
+    """The service, installed as an administrator does it, and not started."""
+    from tests.rig.installed import install  # noqa: PLC0415  (of the guest alone)
+
+    install()
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     if MODE is None:
         terminalreporter.write_line("tests/rig was left out: it runs in a guest with real kernel devices, `make rig`")

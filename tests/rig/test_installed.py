@@ -33,7 +33,6 @@ from tests.rig.installed import (
     Visitor,
     children,
     inside,
-    install,
     journal,
     main_pid,
     must,
@@ -44,7 +43,7 @@ from tests.rig.installed import (
 )
 from tests.rig.punctual import ATTEMPTS
 
-pytestmark = pytest.mark.timeout(420)
+pytestmark = [pytest.mark.timeout(420), pytest.mark.usefixtures("installed")]
 
 UNITS = ("fringed.service", "fringed-worker@1.service")
 PATTERN = {"frequencies": [1, 8], "shifts": [4, 4]}
@@ -56,11 +55,6 @@ CAMERA = "/dev/v4l/by-path/platform-vivid.0-video-index0"
 """The node's number may be another one after it was pulled out"""
 
 LOSS_S, RETURN_S = 1.0, 5.0
-
-
-@pytest.fixture(scope="module", autouse=True)
-def installed() -> None:
-    install()
 
 
 @pytest.fixture
