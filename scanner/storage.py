@@ -226,6 +226,7 @@ def storage_errors(path: Path) -> Iterator[None]:
     hints = {
         errno.ENOSPC: "the disk is full: free some space",
         errno.EDQUOT: "the quota is used up: free some space",
+        errno.EFBIG: "files of this size are not allowed there: raise the limit (ulimit -f), or give another disk",
         errno.EACCES: "this user may not write there",
         errno.EPERM: "this user may not write there",
         errno.EROFS: "the file system is read-only",
