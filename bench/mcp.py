@@ -1,6 +1,6 @@
 """Speed of the MCP decoder: frames of casey2011, uint8 image to dense rows and to dense XYZ float32.
 
-    python bench/mcp.py [--scene bust] [--pattern own|published] [--runs 20] [--seconds 20] [--threads 2]
+    python bench/mcp.py [--scene bust] [--pattern own|published] [--runs 20] [--seconds 20] [--threads 2] [--calibrated]
 
 Prints the median CPU time of one thread, ms: of a frame decoded by itself to all maps, of one in a series (pitch and
 carriers are known from the frame before) with each stage, of one in a series to rows alone, and of its XYZ; stages that
@@ -37,19 +37,21 @@ def main():
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=0.0)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--calibrated", action="store_true", help="the decoder knows the rig's calibration, too")
     chosen = parser.parse_args()
     cv2.setNumThreads(1)
     numba.set_num_threads(1)
     warm_up()
     frame, sequence, camera, _, calibration = take(f"casey2011/{chosen.scene}", PATTERNS[chosen.pattern])
-    known = decode_next(frame, sequence.pattern, sequence.projector, camera, None)[1]
     given = (frame, sequence.pattern, sequence.projector, camera)
+    rig = calibration if chosen.calibrated else None
+    known = decode_next(*given, None, calibration=rig)[1]
     alone, series, rows, points, stages = [], [], [], [], []
     for _ in range(chosen.runs + 2):
-        timed(alone, lambda: decode_image(*given))
-        decoded, _ = timed(series, lambda: decode_next(*given, known))
+        timed(alone, lambda: decode_image(*given, rig))
+        decoded, _ = timed(series, lambda: decode_next(*given, known, calibration=rig))
         stages.append(decoded.details["stages_ms"])
-        found, _ = timed(rows, lambda: positions_next(*given, known))
+        found, _ = timed(rows, lambda: positions_next(*given, known, calibration=rig))
         timed(points, lambda: triangulate(calibration, rows=found))  # noqa: B023
     for name in stages[-1]:
         print(f"  {name:16s} {np.median([s[name] for s in stages[2:]]):7.2f} ms")
@@ -61,7 +63,7 @@ def main():
     mcp_plain.compare(lambda: decode_next(*given, known), upright, calibration, found)
     reference = reference_decoder(given, max(3, chosen.runs // 4))
     if chosen.seconds:
-        rate = sustained(frame, sequence, camera, calibration, chosen.threads, chosen.seconds)
+        rate = sustained(frame, sequence, camera, calibration, rig, chosen.threads, chosen.seconds)
         print(f"  {chosen.threads} threads over {chosen.seconds:g} s: {rate:.1f} frames a second, image to XYZ")
     return int(reference > MOST_REFERENCE_MS)
 
@@ -87,13 +89,13 @@ def timed(times, work):
     return result
 
 
-def sustained(frame, sequence, camera, calibration, threads, seconds):
+def sustained(frame, sequence, camera, calibration, rig, threads, seconds):
     """Frames a second, image to XYZ, of some threads that decode without a pause."""
     end = time.perf_counter() + seconds
     counts = [0] * threads
 
     def work(number):
-        decoder = decoder_for(sequence, camera)
+        decoder = decoder_for(sequence, camera, calibration=rig)
         while time.perf_counter() < end:
             decoder.add(0, frame)
             triangulate(calibration, rows=decoder.positions())

@@ -131,15 +131,17 @@ def figures_of(values):
     return dict(zip((h for h in HEADINGS if h != "|"), values, strict=True))
 
 
-def measure(frame, sequence, camera, truth, calibration):
+def measure(frame, sequence, camera, truth, calibration, *, calibrated=False):
     """What was decoded of one frame (or of a list of them), and figures in the order of HEADINGS.
+
+    calibrated: the decoder, too, knows the calibration, and the carriers' phases by it.
 
     Raises:
         DecodeError: decoding is refused.
     """
     pattern = sequence.pattern
     begin = time.perf_counter()
-    decoder = decoder_for(sequence, camera)
+    decoder = decoder_for(sequence, camera, calibration=calibration if calibrated else None)
     for position, each in enumerate(frame if isinstance(frame, list) else [frame]):
         decoder.add(position, each)
     decoded = decoder.finish()
@@ -193,6 +195,7 @@ def main():
     parser.add_argument("--axis", choices=("x", "y"))
     parser.add_argument("--options", default="", help="of the simulated world, key=value&key=value")
     parser.add_argument("--precorrection", type=float, default=2.3)
+    parser.add_argument("--calibrated", action="store_true", help="the decoder knows the rig's calibration, too")
     chosen = parser.parse_args()
     low = {0, 1, 3, 7, 9}  # columns where less is worse
     print(f"{'scene':14s} {'pattern':9s} " + " ".join(f"{h:>6s}" for h in HEADINGS))
@@ -204,7 +207,8 @@ def main():
             for seed in range(chosen.seeds):
                 device = f"{chosen.rig}/{scene}?seed={seed}" + (f"&{chosen.options}" if chosen.options else "")
                 try:
-                    runs.append(measure(*take(device, pattern, chosen.precorrection))[1])
+                    taken = take(device, pattern, chosen.precorrection)
+                    runs.append(measure(*taken, calibrated=chosen.calibrated)[1])
                 except DecodeError as error:
                     print(f"{scene:14s} {name:9s} refused: {error}")
             if runs:

@@ -1,8 +1,9 @@
 """The targets of the default MCP decoder, row by row: what is reached, what must be and what it aims at.
 
-    python bench/mcp_targets.py [--seeds 3] [--only texture,blocks] [--short]
+    python bench/mcp_targets.py [--seeds 3] [--only texture,blocks] [--short] [--calibrated]
 
-Every figure is the worst of all seeds on casey2011 with the true calibration; `how right` is said in mcp_accuracy.py.
+Every figure is the worst of all seeds on casey2011 with the true calibration (the decoder itself knows it with
+--calibrated alone); `how right` is said in mcp_accuracy.py.
 A line ends in `ok` (the aim is reached), `must` (what must be is) or `SHORT`; exit status 1 if one does. Time is not
 measured here but in mcp.py.
 """
@@ -150,13 +151,13 @@ ROWS = [
 ]
 
 
-def scene_figures(scene, pattern, seeds, options="", gamma=2.3):
+def scene_figures(scene, pattern, seeds, options="", gamma=2.3, *, calibrated=False):
     """Figures by name, one dictionary a seed."""
     found = []
     for seed in range(seeds):
         device = f"casey2011/{scene}?seed={seed}" + (f"&{options}" if options else "")
         try:
-            found.append(figures_of(measure(*take(device, pattern, gamma))[1]))
+            found.append(figures_of(measure(*take(device, pattern, gamma), calibrated=calibrated)[1]))
         except DecodeError as error:
             print(f"{scene} seed {seed} refused: {error}")
             found.append({})
@@ -169,7 +170,7 @@ def worst(found, figure, more):
     return min(values, key=lambda v: (not np.isnan(v), v)) if more else max(values, key=lambda v: (np.isnan(v), v))
 
 
-def strips(seeds):
+def strips(seeds, *, calibrated=False):
     """Right share of what is decided, and decided share of true crossings, at each width of an isolated strip.
 
     A board seen through a slit: all else is dark (the board's frame with the projector off). Strips stand every 60 px.
@@ -179,13 +180,13 @@ def strips(seeds):
     for width in STRIPS:
         right = decided = crossings = 0
         refused = 0
-        for seed, (frame, sequence, camera, truth, _) in enumerate(runs):
+        for seed, (frame, sequence, camera, truth, calibration) in enumerate(runs):
             random = np.random.default_rng(seed)
             dark = np.clip(random.normal(3, 1, frame.shape), 0, 255).astype(frame.dtype)
             for left in np.linspace(60, frame.shape[1] - 60 - width, 4).astype(int):
                 inside = np.zeros(frame.shape, bool)
                 inside[:, left : left + width] = True
-                decoder = decoder_for(sequence, camera)
+                decoder = decoder_for(sequence, camera, calibration=calibration if calibrated else None)
                 decoder.add(0, np.where(inside, frame, dark))
                 try:
                     peaks = decoder.finish().peaks
@@ -222,6 +223,7 @@ def main():
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--only", default="", help="scenes or groups (published, own, dense, robust, strips, white)")
     parser.add_argument("--short", action="store_true", help="print only what falls short")
+    parser.add_argument("--calibrated", action="store_true", help="the decoder knows the rig's calibration, too")
     chosen = parser.parse_args()
     only = set(filter(None, chosen.only.split(",")))
     patterns = {"own": OWN, "published": PUBLISHED}
@@ -231,13 +233,15 @@ def main():
             if only and not only & {row.group, scene}:
                 continue
             if (row.pattern, scene) not in known:
-                known[row.pattern, scene] = scene_figures(scene, patterns[row.pattern], chosen.seeds)
+                known[row.pattern, scene] = scene_figures(
+                    scene, patterns[row.pattern], chosen.seeds, calibrated=chosen.calibrated
+                )
             value = worst(known[row.pattern, scene], row.figure, row.more)
             missed += line(row.group, scene, row.name, value, row.must, row.aim, row.more, chosen.short)
     if not only or "robust" in only:
-        missed += robust(chosen.seeds, chosen.short)
+        missed += robust(chosen.seeds, chosen.short, calibrated=chosen.calibrated)
     if not only or "strips" in only:
-        for width, (right, share, refused) in strips(chosen.seeds).items():
+        for width, (right, share, refused) in strips(chosen.seeds, calibrated=chosen.calibrated).items():
             told = f"strips     {width:3d} px           right {right:9.4f}   decided {share:6.3f}  refused {refused}"
             wide = "SHORT" if (width >= 51 and not (right >= 0.99 and share >= 0.9)) else ""
             wrong = "SHORT" if width < 51 and right < 0.99 else ""
@@ -252,13 +256,13 @@ def main():
     return 1 if missed else 0
 
 
-def robust(seeds, short):
+def robust(seeds, short, *, calibrated=False):
     """Boards, sphere and bust under bad conditions; how many figures fall short."""
     missed = 0
     targets = {"board": (0.999, 1), "sphere_board": (0.985, 0.995), "bust": (0.95, 0.99)}
     for what, (options, gamma) in ROBUST.items():
         for scene, (must, aim) in targets.items():
-            found = scene_figures(scene, replace(OWN), seeds, options, gamma)
+            found = scene_figures(scene, replace(OWN), seeds, options, gamma, calibrated=calibrated)
             missed += line(what[:10], scene, "right", worst(found, "right", True), must, aim, True, short)
             if scene == "board":
                 missed += line(what[:10], scene, "zmed", worst(found, "zmed", False), 0.3, 0.1, False, short)

@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.crossings import along_stripe
 from scanner.errors import DecodeError
 from scanner.geometry import Array, Calibration
 from scanner.patterns import McpPattern, ProjectorSize
-from scanner.triangulation import triangulate
 
 STRETCH_PX = 256
 """Camera pixels of a stretch: 13 to 50 cycles, which resolve 2 to 8 per cent of frequency and a tenth of it in noise"""
@@ -246,9 +246,7 @@ def _along_stripe(
     sparse = np.full_like(values, np.nan)
     at = (y, x) if pattern.axis == "y" else (x, y)
     sparse[at] = values[at]
-    xyz = triangulate(calibration, **{"rows" if pattern.axis == "y" else "columns": sparse}).xyz[at]
-    seen = calibration.projector.project(calibration.to_projector(xyz))
-    found: Array = seen[:, 0 if pattern.axis == "y" else 1]
+    found: Array = along_stripe(calibration, pattern.axis, sparse)[at]
     return found
 
 

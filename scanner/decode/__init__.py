@@ -1,7 +1,7 @@
 """Frames to projector rows: the contract of every decoder, and the one that fits a pattern.
 
 A decoder is given frames one at a time, in any order, as they arrive; what is left to do after the last one is
-small. It knows the pattern and the camera's format, and no devices; it may be told the calibration.
+small. It knows the pattern and the camera's format, and no devices; MCP's may know the rig's calibration, as evidence.
 """
 
 from __future__ import annotations
@@ -164,7 +164,8 @@ def decoder_for(
         name: "default", or a decoder of that method by name: "casey2011" for MCP, the dissertation's own.
         observer: told the intermediate images, if one is given.
         mcp_phase: a calibration's code-to-phase fit, if it has one. "casey2011" alone uses it: others know the rows.
-        calibration: the rig's, if it has one. No decoder needs it, and none uses it so far.
+        calibration: the rig's, if it has one, for MCP's default decoder: it tells the carriers' phases. Others do
+            without.
 
     Raises:
         DecodeError: no such decoder for this method, or one that has no stages for the observer.
@@ -187,7 +188,7 @@ def decoder_for(
     if isinstance(sequence.pattern, McpPattern):
         from scanner.decode.mcp import McpDecoder  # noqa: PLC0415
 
-        return McpDecoder(sequence, camera)
+        return McpDecoder(sequence, camera, calibration)
     if isinstance(sequence.pattern, CompositePattern):
         from scanner.decode.composite import CompositeDecoder  # noqa: PLC0415
 

@@ -10,6 +10,7 @@ soft:
     carriers       brightness along the chains; the magnification at which all carriers stand out  4.3
     magnification  the same at each peak, as a smooth field                                        (4.3 has one for all)
     emissions      amplitude of each carrier over local brightness; likelihood of each stripe      4.4, 4.5
+    coherent       the same against the phases that each stripe would give, on a calibrated rig     (not in the source)
     hmm            one model over both kinds of stripe: Viterbi and forward-backward               5.2, 5.3
     subpixel       the profile averaged along the stripe, its odd part fitted                      (not in the source)
     dense          rows between the stripes; all maps                                              2.1, 3.7
@@ -21,7 +22,7 @@ module; it is not this one.
 
 from __future__ import annotations
 
-from scanner.decode.mcp import carriers, local_field, tracks
+from scanner.decode.mcp import carriers, coherent, local_field, tracks
 from scanner.decode.mcp.decoder import McpDecoder, decode_image
 from scanner.patterns import CameraFormat, McpPattern, ProjectorSize
 
@@ -38,5 +39,6 @@ def warm_up() -> None:
         frame = (10 + light * (0.8 * camera.max_value)).astype(camera.dtype)
         decode_image(frame, pattern, projector, camera)
     carriers.warm_up()
+    coherent.warm_up()
     local_field.warm_up()
     tracks.warm_up()

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.mcp import description, emissions, hmm, linking, magnification, stripes, subpixel
+from scanner.crossings import Crossings
+from scanner.decode.mcp import coherent, description, emissions, hmm, linking, magnification, stripes, subpixel
 from scanner.decode.mcp.locate import Array, Found, Stages
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.ranks import median
@@ -57,25 +58,28 @@ class Decision:
     figures: dict[str, Any]
 
 
-def decide(found: Found, model: PatternModel, clock: Stages) -> Decision:
+def decide(found: Found, model: PatternModel, clock: Stages, crossings: Crossings | None = None) -> Decision:
     """Tell the stripes apart.
 
     Args:
         found: a search without a fault.
         model: the pattern's tables.
         clock: takes the stages' times.
+        crossings: of a calibrated rig.
     """
     _, _, tracks, signals, search = found.parts()
     size = magnification.window_px(model, search.scale)
     shape = (found.reduced.shape[1], found.reduced.shape[0] * stripes.STEP)
     with clock.stage("field"):
         fields = magnification.fit_fields(signals.light, tracks, model, search, size, shape)
-    trials = [_decide_by(field, size, found, model, clock) for field in fields]
+    trials = [_decide_by(field, size, found, model, clock, crossings) for field in fields]
     # A field that is not the surface's contradicts itself from peak to peak: fewer are sure of their stripe.
     return max(trials, key=lambda trial: (trial.agreement.holds, np.count_nonzero(trial.label >= 0)))
 
 
-def _decide_by(scale_field: Array, size: int, found: Found, model: PatternModel, clock: Stages) -> Decision:
+def _decide_by(
+    scale_field: Array, size: int, found: Found, model: PatternModel, clock: Stages, crossings: Crossings | None
+) -> Decision:
     """Tell the stripes apart by one field of magnifications, in windows of `size` samples."""
     peaks, chains, tracks, signals, search = found.parts()
     with clock.stage("emissions"):
@@ -88,9 +92,18 @@ def _decide_by(scale_field: Array, size: int, found: Found, model: PatternModel,
     gap = hmm.gaps(sites.start, peaks.y[sites.index], peaks.height[sites.index], found.pitch, model.weakest)
     votes = np.zeros((len(gap), model.stripes), np.float32)
     posterior = votes
-    for _ in range(ROUNDS):
+    shift = coherent.NONE
+    for again in range(ROUNDS):
+        if again and crossings is not None:
+            with clock.stage("phases"):
+                shift = coherent.align(here, posterior, crossings, model)
         with clock.stage("emissions"):
-            evidence, stray_log = emissions.log_likelihood(here, model, modulation, floor)
+            plain, stray_log = emissions.log_likelihood(here, model, modulation, floor)
+            evidence = plain
+        if crossings is not None and shift.holds:
+            with clock.stage("phases"):
+                phases, channels = (crossings, shift), (model, modulation, floor)
+                evidence, stray_log = coherent.settle((plain, stray_log), here, size, posterior, phases, channels)
         with clock.stage("columns' model"):
             posterior, _stray = hmm.smooth_columns(evidence + votes, sites.start, gap, tables, stray_log)
         with clock.stage("votes"):
@@ -109,7 +122,7 @@ def _decide_by(scale_field: Array, size: int, found: Found, model: PatternModel,
         label[tracks.links.order[~np.repeat(long_enough, tracks.links.lengths)]] = -1
         label[found.beyond] = -1
     with clock.stage("agreement"):
-        agrees = description.agreement(here, evidence, model, modulation, path, (sites.start, gap))
+        agrees = description.agreement(here, plain, model, modulation, path, (sites.start, gap))
     with clock.stage("sub-pixel"):
         fine = subpixel.refine(found.reduced, peaks, chains, label, found.pitch, even=model.even)
     figures = {
@@ -122,6 +135,7 @@ def _decide_by(scale_field: Array, size: int, found: Found, model: PatternModel,
         "modulation": [round(float(m), 3) for m in modulation],
         "noise_floor": [round(float(f), 4) for f in floor],
         "window_px": size,
+        **({} if crossings is None else {"coherent": shift.as_dict()}),
         "agreement": {key: np.round(value, 4).tolist() for key, value in asdict(agrees).items()},
         "peaks": len(peaks),
         "joined_tracks": int(tracks.joined.sum()),

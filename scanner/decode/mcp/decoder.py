@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.crossings import Crossings, crossings_of, turned_over
 from scanner.decode import Decoded
 from scanner.decode.frames import FrameCheck
 from scanner.decode.mcp.decision import Decision, decide
@@ -20,6 +21,7 @@ from scanner.decode.mcp.ranks import median
 from scanner.decode.mcp.resolution import if_whole, refuse_too_fine
 from scanner.decode.mcp.white import RATIO_BITS, divided, in_grey_levels
 from scanner.errors import DecodeError
+from scanner.geometry import Calibration
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
 
 
@@ -28,6 +30,7 @@ def decode_image(
     pattern: McpPattern,
     projector: ProjectorSize,
     camera: CameraFormat,
+    calibration: Calibration | None = None,
 ) -> Decoded:
     """Decode one image.
 
@@ -44,7 +47,7 @@ def decode_image(
     Raises:
         DecodeError: no pattern, another pattern, one turned by 90 degrees, or stripes too fine for the camera.
     """
-    return decode_next(image, pattern, projector, camera, None)[0]
+    return decode_next(image, pattern, projector, camera, None, calibration=calibration)[0]
 
 
 def decode_next(
@@ -55,6 +58,7 @@ def decode_next(
     known: Known | None,
     *,
     even: bool = False,
+    calibration: Calibration | None = None,
 ) -> tuple[Decoded, Known]:
     """Decode one image of a series.
 
@@ -69,7 +73,7 @@ def decode_next(
     Raises:
         DecodeError: as `decode_image`.
     """
-    seen, learnt = _see(image, pattern, projector, camera, known, even=even)
+    seen, learnt = _see(image, pattern, projector, camera, known, even, calibration)
     decoded = maps_of(seen.image, seen.found, seen.decided, seen.model, seen.clock)
     decoded = upside_down(decoded) if seen.upside_down else decoded
     return decoded if pattern.axis == "y" else turned_back(decoded), learnt
@@ -84,6 +88,7 @@ def positions_next(
     memory: Array | None = None,
     *,
     even: bool = False,
+    calibration: Calibration | None = None,
 ) -> tuple[Array, Known]:
     """`decode_next` for those who want rows (axis "x": columns) and no other map: (H, W) float32, NaN where undecided.
 
@@ -94,7 +99,7 @@ def positions_next(
     Raises:
         DecodeError: as `decode_image`.
     """
-    seen, learnt = _see(image, pattern, projector, camera, known, even=even)
+    seen, learnt = _see(image, pattern, projector, camera, known, even, calibration)
     rows = (np.empty(image.size, np.float32) if memory is None else memory).reshape(seen.image.shape)
     fill_rows(seen.found, seen.decided, seen.model, rows)
     rows = np.ascontiguousarray(rows[::-1]) if seen.upside_down else rows
@@ -119,44 +124,50 @@ def _see(
     projector: ProjectorSize,
     camera: CameraFormat,
     known: Known | None,
-    *,
     even: bool,
+    calibration: Calibration | None,
 ) -> tuple[_Seen, Known]:
     pattern.validate(projector)
     upright = upright_image(image, pattern, camera)
     model = PatternModel.of(pattern, projector, even=even)
-    seen = None if known is None else _by_what_is_known(upright, model, camera, known)
+    crossings = None if calibration is None else crossings_of(calibration, pattern, projector)
+    seen = None if known is None else _by_what_is_known(upright, model, camera, known, crossings)
     if seen is not None and known is not None:
         return seen, known
-    seen = _see_anew(upright, model, camera)
+    seen = _see_anew(upright, model, camera, crossings)
     return seen, _learnt(seen.found, seen.decided, upside_down=seen.upside_down)
 
 
-def _by_what_is_known(upright: Image, model: PatternModel, camera: CameraFormat, known: Known) -> _Seen | None:
+def _by_what_is_known(
+    upright: Image, model: PatternModel, camera: CameraFormat, known: Known, crossings: Crossings | None
+) -> _Seen | None:
     """None where it does not hold any more."""
     clock = Stages()
     image = np.ascontiguousarray(upright[::-1]) if known.upside_down else upright
     found = locate(image, model, camera, clock, known)
     if found.fault is not None:
         return None
-    decided = decide(found, model, clock)
+    if crossings is not None and known.upside_down:
+        crossings = turned_over(crossings, len(image))
+    decided = decide(found, model, clock, crossings)
     if not decided.agreement.holds or not known.still_holds(_learnt(found, decided, upside_down=known.upside_down)):
         return None
     return _Seen(image, found, decided, model, known.upside_down, clock)
 
 
-def _see_anew(upright: Image, model: PatternModel, camera: CameraFormat) -> _Seen:
+def _see_anew(upright: Image, model: PatternModel, camera: CameraFormat, crossings: Crossings | None) -> _Seen:
     clock = Stages()
     found = locate(upright, model, camera, clock)
     if found.fault is not None:
         _explain(found, upright, model, camera)
-    decided = decide(found, model, clock)
+    decided = decide(found, model, clock, crossings)
     if decided.agreement.holds:
         return _Seen(upright, found, decided, model, False, clock)
     # The projector may hang upside down: then the stripes' order is reversed.
     reversed_image = np.ascontiguousarray(upright[::-1])
     found = locate(reversed_image, model, camera, clock)
-    again = decide(found, model, clock) if found.fault is None else decided
+    over = None if crossings is None else turned_over(crossings, len(upright))
+    again = decide(found, model, clock, over) if found.fault is None else decided
     if again.agreement.holds:
         return _Seen(reversed_image, found, again, model, True, clock)
     _refuse_turned(upright, model, camera)
@@ -203,12 +214,13 @@ class McpDecoder:
         DecodeError: the sequence is not MCP.
     """
 
-    def __init__(self, sequence: PatternSequence, camera: CameraFormat) -> None:
+    def __init__(self, sequence: PatternSequence, camera: CameraFormat, calibration: Calibration | None = None) -> None:
         if not isinstance(sequence.pattern, McpPattern):
             raise DecodeError(f"the MCP decoder was given method {sequence.pattern.method!r}")
         self._sequence = sequence
         self._pattern = sequence.pattern
         self._camera = camera
+        self._calibration = calibration
         self._known: Known | None = None
         self._memory = np.empty(0, np.float32)
         self.next_frame()
@@ -235,7 +247,9 @@ class McpDecoder:
         known, self._known = self._known, None  # a frame that is refused teaches nothing
         image, camera = self._to_decode()
         two, size = self._white is not None, self._sequence.projector
-        decoded, self._known = decode_next(image, self._pattern, size, camera, known, even=two)
+        decoded, self._known = decode_next(
+            image, self._pattern, size, camera, known, even=two, calibration=self._calibration
+        )
         if self._white is None:
             return decoded
         white = grey(self._white, self._camera)
@@ -254,7 +268,9 @@ class McpDecoder:
         if self._memory.size != image.size:
             self._memory = np.empty(image.size, np.float32)
         two, size = self._white is not None, self._sequence.projector
-        rows, self._known = positions_next(image, self._pattern, size, camera, known, self._memory, even=two)
+        rows, self._known = positions_next(
+            image, self._pattern, size, camera, known, self._memory, even=two, calibration=self._calibration
+        )
         return rows
 
     def _to_decode(self) -> tuple[NDArray[Any], CameraFormat]:

@@ -54,19 +54,34 @@ carriers that are on 0 to .06 lie beyond three sigmas, of those off 0 to .04; a 
 
 
 @dataclass(frozen=True, eq=False)
+class Waves:
+    """parts: (P, 2 N) float32, each carrier's cosine and sine about the window's middle, over brightness. x, y, length:
+    (P,) float32 px, that middle, and how long the window is.
+    """
+
+    parts: Array
+    x: Array
+    y: Array
+    length: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Amplitudes:
     """ratio: (P, N) float32, carrier amplitude over brightness. sigma: (P, N) float32, its noise (one component).
-    light: (P,) float32, brightness above the valleys in the window; about 1 on joined tracks.
+    light: (P,) float32, brightness above the valleys in the window; about 1 on joined tracks. waves: with their phases.
     """
 
     ratio: Array
     sigma: Array
     light: Array
+    waves: Waves | None = None
 
     def at(self, index: Ints) -> Amplitudes:
         """Those of some peaks."""
         wide = index.astype(np.intp)  # NumPy takes rows by numbers of that kind in a tenth of the time
-        return Amplitudes(*(np.take(part, wide, axis=0) for part in (self.ratio, self.sigma, self.light)))
+        ratio, sigma, light = (np.take(part, wide, axis=0) for part in (self.ratio, self.sigma, self.light))
+        waves = self.waves and Waves(*(np.take(part, wide, axis=0) for part in vars(self.waves).values()))
+        return Amplitudes(ratio, sigma, light, waves)
 
 
 def measure(light: Array, tracks: Tracks, field: Array, model: PatternModel, scale: float, size: int) -> Amplitudes:
@@ -88,12 +103,13 @@ def measure(light: Array, tracks: Tracks, field: Array, model: PatternModel, sca
     omega = tuple(float(w) for w in 2 * np.pi * model.carriers.astype(np.float64) / scale)
     chains = tracks.chains
     of_chain = np.minimum(chains.lengths * STEP, size * (1 + tracks.joined)).astype(np.int32)
-    of_peak = np.empty(count, np.int32)
+    of_peak = np.zeros(count, np.int32)  # places that a joined track passes over keep none
     of_peak[chains.order] = np.repeat(of_chain, chains.lengths)
     pick = np.rint((field - 1) / FIELD_STEP).astype(np.int32)
     ratio = np.zeros((count, channels), np.float32)
     sigma = np.full((count, channels), NOTHING_SEEN)
     bright = np.zeros(count, np.float32)
+    wave, begin = np.zeros((count, 2 * channels), np.float32), np.zeros(count, np.int32)
     for length in np.unique(of_chain):
         if length < 2 * STEP:
             continue  # fewer samples than unknowns say nothing
@@ -108,8 +124,10 @@ def measure(light: Array, tracks: Tracks, field: Array, model: PatternModel, sca
         shortness = np.float32(max(size / length, 1) ** SHORT_POWER)
         hop = max(1, int(length) // (8 * STEP))
         links = (chains.order, chains.start, chosen, pick)
-        _fit(light, *links, basis, inverse, _window(int(length)), shortness, hop, ratio, sigma, bright)
-    seen = Amplitudes(ratio, sigma, bright)
+        _fit(light, *links, basis, inverse, _window(int(length)), shortness, hop, ratio, sigma, bright, wave, begin)
+    x = (STEP * chains.column[chains.order[begin]] + (of_peak - 1) / 2).astype(np.float32)
+    y = tracks.y[chains.order[np.minimum(begin + of_peak // (2 * STEP), len(chains.order) - 1)]]
+    seen = Amplitudes(ratio, sigma, bright, Waves(wave, x, y, of_peak.astype(np.float32)))
     return seen.at(tracks.place) if tracks.joined.any() else seen
 
 
@@ -155,6 +173,8 @@ def _fit(
     ratio: Array,
     sigma: Array,
     bright: Array,
+    wave: Array,
+    middle: Ints,
 ) -> None:
     unknowns, size, padded = inverse.shape[1], basis.shape[1], basis.shape[2]
     channels = (unknowns - GROUND) // 2
@@ -178,7 +198,10 @@ def _fit(
                 for i in range(channels):
                     ratio[k, i] = ratio[j, i]
                     sigma[k, i] = sigma[j, i]
+                for u in range(2 * channels):
+                    wave[k, u] = wave[j, u]
                 bright[k] = bright[j]
+                middle[k] = middle[j]
                 continue
             previous = begin
             m = pick[k]
@@ -193,6 +216,7 @@ def _fit(
             # The bend's mean over a Hann window, (1 / 3 - 2 / pi^2) of its value at the ends.
             mean = fitted[0] + np.float32(0.1307) * fitted[2]
             bright[k] = mean
+            middle[k] = begin
             if mean <= 0:
                 continue
             variance = max(energy - explained, np.float32(0)) / free
@@ -200,6 +224,7 @@ def _fit(
                 c = GROUND + 2 * i
                 a, b = fitted[c], fitted[c + 1]
                 ratio[k, i] = np.sqrt(a * a + b * b) / mean
+                wave[k, 2 * i], wave[k, 2 * i + 1] = a / mean, b / mean
                 spread = np.float32(0.5) * (inverse[m, c, c] + inverse[m, c + 1, c + 1])
                 sigma[k, i] = np.sqrt(variance * spread) / mean * shortness
 
