@@ -172,7 +172,7 @@ def _steady(shots: Shots, image: int, count: int) -> list[NDArray[np.float64]]:
 def _exposure(shots: Shots, refresh: int) -> int:
     """Short against a refresh where full white is steady enough at that; else one modulation period."""
     caps = shots.camera.capabilities
-    short = max(refresh // 16, caps.exposure_min_ns)
+    short = min(max(refresh // 16, caps.exposure_min_ns), caps.exposure_max_ns)
     period = shots.projector.capabilities.modulation_period_ns
     if period is None:
         return short

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+from dataclasses import replace
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
@@ -59,6 +62,21 @@ def test_too_little_contrast_is_refused_in_words() -> None:
     with pytest.raises(SyncError, match="black and white differ") as error:
         measured({}, device="quick/board?seed=1&exposure_scale=0.001&ambient=1.0")
     assert "projector lights" in (error.value.hint or "")
+
+
+def test_a_camera_that_exposes_shortly_is_not_asked_for_more() -> None:
+    clock = VirtualClock()
+    screen = open_projector("simulated", DEVICE, {"declare_latency": False}, clock)
+    camera = open_camera("simulated", DEVICE, {}, clock)
+    short = replace(camera.capabilities, exposure_max_ns=500_000)
+    with (
+        closing(screen),
+        closing(camera),
+        patch.object(type(camera), "capabilities", short),
+        patch.object(camera, "apply", wraps=camera.apply) as asked,
+    ):
+        measure_latency(screen, camera, clock)
+    assert asked.call_args.args[0].exposure_ns == 500_000
 
 
 def test_a_static_projector_has_no_latency() -> None:
