@@ -179,7 +179,7 @@ def _exposure(shots: Shots, refresh: int) -> int:
     shots.expose_for(short)
     seen = [float(blocks.max()) for blocks in _steady(shots, WHITE, 4)]
     steady = np.ptp(seen) < 0.02 * np.mean(seen) and np.mean(seen) > 0.02 * caps.max_value
-    return short if steady else period
+    return short if steady or period > caps.exposure_max_ns else period
 
 
 def _burst(shots: Shots, scale: _Scale, delay_ns: int, until_ns: int) -> list[_Sample]:

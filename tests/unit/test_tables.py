@@ -23,7 +23,11 @@ def tables(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def test_every_table_has_its_page_and_the_index_lists_it(tables: ModuleType) -> None:
     listed = tables.__main__.TABLES
-    assert {path.stem for path in PAGES.glob("*.md")} == {"index", "held-out", *(name for name, _, _ in listed.values())}
+    assert {path.stem for path in PAGES.glob("*.md")} == {
+        "index",
+        "held-out",
+        *(name for name, _, _ in listed.values()),
+    }
     assert (PAGES / "index.md").read_text() == tables.__main__.index_page(), "run `make tables`"
     for argument, (name, title, _) in listed.items():
         text = (PAGES / f"{name}.md").read_text()
