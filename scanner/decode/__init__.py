@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode.stages import Observer
 from scanner.errors import DecodeError
-from scanner.geometry import Calibration
 from scanner.patterns import (
     CameraFormat,
     CompositePattern,
@@ -25,6 +24,9 @@ from scanner.patterns import (
     PatternSequence,
     PmpPattern,
 )
+
+if TYPE_CHECKING:  # it brings compiled kernels, which those who only ask for a decoder's name do without
+    from scanner.geometry import Calibration
 
 Map = NDArray[np.float32]
 """(H, W) float32, NaN where undecided"""

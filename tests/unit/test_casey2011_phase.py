@@ -58,8 +58,8 @@ def test_a_fit_of_another_pattern_is_named_and_not_used():
 @pytest.mark.parametrize("fit", [None, FIT])
 def test_a_scan_s_decoder_is_told_the_fit_of_its_calibration(fit, monkeypatch):
     asked = []
-    monkeypatch.setattr(reconstruct, "decoder_for", lambda *a: asked.append(a[4]) or decoder_for(*a))
-    monkeypatch.setattr(reconstruct_live, "decoder_for", lambda *a, mcp_phase: asked.append(mcp_phase))
+    monkeypatch.setattr(reconstruct, "decoder_for", lambda *a, **k: asked.append(a[4]) or decoder_for(*a, **k))
+    monkeypatch.setattr(reconstruct_live, "decoder_for", lambda *a, mcp_phase, calibration: asked.append(mcp_phase))
     matrix = np.array([[400.0, 0, 128], [0, 400.0, 96], [0, 0, 1]])
     lens = Lens((256, 192), matrix, np.zeros(5))
     rig = Calibration(lens, lens, np.eye(3), np.array([0.0, 100, 0]), extra={"mcp_phase": fit})
