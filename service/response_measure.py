@@ -10,6 +10,7 @@ from scanner.calibration.grey_levels import LEVELS, LevelResponse, response_of_l
 from scanner.clock import Clock
 from scanner.devices import ProjectorKind
 from scanner.errors import CalibrationError, ConfigError
+from scanner.patterns.sequence import Precorrection
 from scanner.sequencer.light import fitting_exposure
 from scanner.sequencer.shots import Shots
 from service.config import RigConfig
@@ -36,23 +37,31 @@ def first_response(config: RigConfig, clock: Clock, stage: Callable[[str], None]
     """The response that a calibration begins with, and what to say of it.
 
     Returns:
-        None for a rig whose calibration has one, and where nothing in view tells it: a pose's fringes have to.
+        None where nothing in view tells it: what the rig's calibration has stays, or a pose's fringes have to tell it.
 
     Raises:
         DeviceError: a device cannot be opened, or failed.
     """
     stage("opening devices")
     opened = open_rig(config.model_dump(mode="json"), clock)
+    claimed: Precorrection | None = None
     try:
-        if opened.known.precorrection is not None:
-            return None, "response: undone as the rig's calibration has it"
+        claimed = opened.known.precorrection
         found = _measured(opened, clock, stage)
     except (CalibrationError, ConfigError) as error:
-        return None, f"response: not told by grey levels ({error}); the first pose's fringes will"
+        instead = "the first pose's fringes will" if claimed is None else "what the rig's calibration has stays"
+        return None, f"response: not told by grey levels ({error}); {instead}"
     finally:
         opened.close()
-    words = f"gamma {found.gamma:.3f} +- {found.sigma:.3f}" if "gamma" in found.response else "a table"
-    return found, f"response: {words}, by {len(found.levels)} grey levels on what is in view; scans will undo it"
+    words = f"gamma {found.gamma:.4f} +- {found.sigma:.4f}" if "gamma" in found.response else "a table"
+    instead = "" if claimed is None else f", instead of {_named(claimed)}, which the rig's calibration has"
+    return found, (
+        f"response: {words}, by {len(found.levels)} grey levels on what is in view; scans will undo it{instead}"
+    )
+
+
+def _named(claimed: Precorrection) -> str:
+    return "a table" if claimed.gamma is None else f"gamma {claimed.gamma:.4f}"
 
 
 def _measured(opened: OpenRig, clock: Clock, stage: Callable[[str], None]) -> LevelResponse:

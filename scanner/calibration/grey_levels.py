@@ -28,6 +28,9 @@ LEAST_CONTRAST = 0.05
 LIT_SHARE = 0.25
 """Of the contrast of the brightest pixels: what has less is lit by the rest of the room"""
 
+LEAST_SIGMA = 1e-4
+"""Of an exponent: a calibration file has it in four decimals"""
+
 MOST_MISFIT = 0.004
 """Rms that a pure exponent may leave, of white: half a second harmonic of a hundredth. Beyond, a table is wanted."""
 
@@ -39,7 +42,7 @@ class LevelResponse:
     gamma: float
     """exponent that fits best"""
     sigma: float
-    """1-sigma of it"""
+    """1-sigma of it: of what the fit leaves, and of grey levels that are whole numbers"""
     misfit: float
     """rms of what the exponent leaves, share of white"""
     table: tuple[float, ...]
@@ -116,7 +119,8 @@ def response_of_levels(
             hint="are the frames in the order of their levels? Switch dynamic contrast off",
         )
     light = np.clip(np.maximum.accumulate(light), 0, 1)
-    gamma, sigma, misfit = _exponent(steps, light)
+    # Rounding is averaged over pixels only where noise or texture dithers it: it is taken as the same in all.
+    gamma, sigma, misfit = _exponent(steps, light, float(1 / np.sqrt(12 * np.mean(weight**2))))
     table = np.clip(PchipInterpolator(steps, light)(np.arange(256)), 0, 1)
     return LevelResponse(
         gamma, sigma, misfit, tuple(float(v) for v in table), tuple(int(v) for v in steps),
@@ -124,8 +128,11 @@ def response_of_levels(
     )  # fmt: skip
 
 
-def _exponent(levels: NDArray[Any], light: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Least squares of light = (level / 255)^g: g, its 1-sigma and the rms left; Gauss-Newton from a log-log fit."""
+def _exponent(levels: NDArray[Any], light: NDArray[np.float64], rounding: float) -> tuple[float, float, float]:
+    """Least squares of light = (level / 255)^g: g, its 1-sigma and the rms left; Gauss-Newton from a log-log fit.
+
+    rounding: 1-sigma that rounding to whole grey levels leaves in each light, share of white.
+    """
     inner = (levels > 0) & (levels < 255) & (light > 1e-4)
     v, seen = levels[inner] / 255.0, light[inner]
     logs = np.log(v)
@@ -137,4 +144,5 @@ def _exponent(levels: NDArray[Any], light: NDArray[np.float64]) -> tuple[float, 
     left = seen - v**gamma
     misfit = float(np.sqrt(np.mean(left**2)))
     slope = v**gamma * logs
-    return gamma, float(np.sqrt(left @ left / max(len(v) - 1, 1) / (slope @ slope))), misfit
+    variance = float(left @ left) / max(len(v) - 1, 1) + rounding**2
+    return gamma, max(float(np.sqrt(variance / (slope @ slope))), LEAST_SIGMA), misfit

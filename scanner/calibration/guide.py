@@ -123,6 +123,22 @@ class Guide:
             return "tilts, depths and picture are covered: repeat them elsewhere, with other tilts"
         return "enough for a calibration: q ends, or go on with other tilts and places"
 
+    def lacking(self) -> str:
+        """Which conditions of the how-to the poses do not meet (tilts, depth, coverage), in words; "" if none."""
+        if not self.poses:
+            return ""
+        standings = self.standings
+        depths = np.array([s.depth for s in standings])
+        span = float(np.ptp(depths) / depths[0])
+        words = []
+        if untilted := [side for side in SIDES if not any(_tilted_to(s, side) for s in standings)]:
+            words.append(f"no pose is tilted with its {' or its '.join(untilted)} nearer")
+        if span < 2 * DEPTH_SHARE:
+            words.append(f"depths span {span:.1%} of the first pose's ({2 * DEPTH_SHARE:.0%} are asked)")
+        if missing := [name for name, there in zip(FIELDS, self.fields(), strict=True) if not there]:
+            words.append(f"no points in {len(missing)} of 9 fields of the camera's picture ({', '.join(missing)})")
+        return "; ".join(words)
+
     def _tilts_wanted(self) -> str | None:
         standings = self.standings
         counts = {side: sum(_tilted_to(s, side) for s in standings) for side in SIDES}

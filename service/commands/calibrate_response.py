@@ -177,7 +177,7 @@ def _facts(found: LevelResponse | Response) -> list[tuple[str, str]]:
         ]
     fits = "an exponent fits" if "gamma" in found.response else "no exponent fits: a table"
     return [
-        ("gamma", f"{found.gamma:.3f} +- {found.sigma:.3f}, with {found.misfit:.2%} of white left: {fits}"),
+        ("gamma", f"{found.gamma:.4f} +- {found.sigma:.4f}, with {found.misfit:.2%} of white left: {fits}"),
         ("levels", f"{len(found.levels)}, seen by {found.pixels:,} pixels"),
     ]
 

@@ -32,6 +32,7 @@ from service.terminal import progress_lines
 
 if TYPE_CHECKING:
     from scanner.calibration.grey_levels import LevelResponse
+    from scanner.calibration.guide import Guide
     from scanner.calibration.solve import Solution, SolveOptions
     from scanner.calibration.targets import Target
     from service.config import RigConfig
@@ -45,10 +46,6 @@ PATIENCE_S = 60.0
 """With nobody at a terminal: without a new pose for so long the run ends with what there is."""
 SEE_S = 0.2
 """A key is looked for this often."""
-GAMMA_OFF = 0.02
-"""Exponent's distance from 1 from which it is kept for projection: below, 8-bit projection leaves as much ripple."""
-LEVELS_DIFFER = 0.1
-"""Share by which the fringes' exponent and the grey levels' may differ unsaid: blur takes so much from overtones."""
 
 
 def run(
@@ -156,6 +153,7 @@ def _guided(
             with keys() as pressed:
                 loop = _Loop(session, asked, pressed, levels)
                 loop.run()
+            _say_lacking(session.guide)
             with progress_lines() as lines:
                 return session.solved(leave_out=True, progress=lines.stage), loop.response
         except (KeyboardInterrupt, ScannerError):
@@ -319,26 +317,24 @@ def _frames(event: Any) -> None:
 
 
 def _response(session: GuidedCalibration, levels: LevelResponse | None) -> dict[str, Any] | None:
-    """The projector's gamma by fringes, told in words; as the calibration file has it where scans should undo it."""
+    """What the fringes tell of the projector's gamma, in words; as the calibration file has it where only they do."""
     from scanner.calibration.response import Response  # noqa: PLC0415
+    from service.response_check import checked  # noqa: PLC0415
 
     found = session.response()
     if not isinstance(found, Response):
         say(f"response: not told{'' if levels is None else ' a second time'} ({found})")
         return None
-    off = abs(found.exponent - 1)
-    real = off > max(3 * found.sigma, GAMMA_OFF) and found.gamma is not None
-    if levels is not None:
-        verdict = "the file has what grey levels told"
-    else:
-        verdict = f"scans will project with gamma {found.gamma:.3f}" if real else "nothing to correct"
-    say(
-        f"response: light follows what is projected to the power of {found.exponent:.3f} +- {found.sigma:.3f}; "
-        f"ripple {found.ripple_px:.3f} px; {verdict}"
-    )
-    if levels is not None and abs(found.exponent - levels.gamma) > LEVELS_DIFFER * levels.gamma:
-        say(f"fringes and grey levels ({levels.gamma:.3f}) differ: fringes are blurred, or the response is no exponent")
-    return {"gamma": found.gamma, "table": None} if real else None
+    response, lines = checked(found, levels)
+    for line in lines:
+        say(line)
+    return response
+
+
+def _say_lacking(guide: Guide | None) -> None:
+    """Which of the how-to's conditions the poses do not meet, in one line."""
+    if guide is not None and (lacking := guide.lacking()):
+        say(f"not met of what a calibration asks for: {lacking}")
 
 
 def _written(

@@ -20,9 +20,11 @@ from scanner.calibration.targets import parse_target
 from scanner.client import Client
 from scanner.clock import VirtualClock
 from scanner.errors import Unreachable
+from scanner.patterns.sequence import Precorrection
 from service.commands import calibrate_run
 from service.config import load_rig
 from service.keys import Keys, keys
+from service.response_check import checked
 from service.response_measure import first_response
 from service.rig_file_edit import set_values
 from tests.unit.simulated_bench import Bench
@@ -181,6 +183,10 @@ def test_a_capture_of_which_nothing_is_heard_is_given_up(monkeypatch: pytest.Mon
     assert len(asked) > 3
 
 
+def levels_of(gamma: float, sigma: float = 0.002) -> LevelResponse:
+    return LevelResponse(gamma, sigma, 0.002, (0.0, 1.0), (0, 128, 255), (0.0, 0.2, 1.0), 500)
+
+
 def test_what_grey_levels_told_stays_and_the_first_pose_checks_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -188,15 +194,66 @@ def test_what_grey_levels_told_stays_and_the_first_pose_checks_it(
         def response(self) -> Response:
             return Response(1.6, 0.01, 1.6, 0.4, 0.1, 0.01, 900)
 
-    levels = LevelResponse(2.2, 0.01, 0.002, (0.0, 1.0), (0, 128, 255), (0.0, 0.2, 1.0), 500)
     asked = calibrate_run._Asked(tmp_path, tmp_path / "live.png", 3, False)
-    looped = calibrate_run._Loop(Told(sight_at(0)), asked, Pressed("  \nq"), levels)  # type: ignore[arg-type]
+    looped = calibrate_run._Loop(Told(sight_at(0)), asked, Pressed("  \nq"), levels_of(2.2))  # type: ignore[arg-type]
     assert looped.response == {"gamma": 2.2}
     looped.run()
     assert looped.response == {"gamma": 2.2}
     said = capsys.readouterr().err
-    assert "to the power of 1.600 +- 0.010; ripple 0.400 px; the file has what grey levels told" in said
-    assert "fringes and grey levels (2.200) differ" in said
+    assert "to the power of 1.600 +- 0.068 (k = 2, 3% of it for print); the file has what grey levels told" in said
+    assert "fringes contradict grey levels: they should have told 2.200, and 0.600 is more" in said
+
+
+@pytest.mark.parametrize(
+    ("exponent", "given", "levels", "contradicted"),
+    [
+        (1.863, 1.0, 1.9, False),  # a print's bias
+        (0.983, 1.9, 1.9, False),
+        (0.983, None, 1.9, False),  # projected through a table
+        (0.807, 2.3, 1.9, False),  # the rig claimed 2.3, it is 1.9
+        (1.1, 1.9, 1.9, True),
+        (1.1, None, 1.9, True),
+        (1.7, 1.0, 1.9, True),
+    ],
+)
+def test_fringes_are_held_against_what_levels_leave_for_them(
+    exponent: float, given: float | None, levels: float, contradicted: bool
+) -> None:
+    found = Response(exponent, 0.003, None if given is None else given * exponent, 0.1, 0.1, 0.01, 900)
+    response, lines = checked(found, levels_of(levels))
+    assert response is None
+    assert ["contradict" in line for line in lines[1:]] == [True] * contradicted
+
+
+@pytest.mark.parametrize(
+    ("exponent", "given", "response", "said"),
+    [
+        (0.983, 1.0, None, "nothing to correct"),
+        (2.25, 1.0, {"gamma": 2.25, "table": None}, "as nothing tells it better"),
+        (0.983, 1.9, None, "gamma 1.900, which stays"),
+        (0.807, 2.3, None, "fringes contradict gamma 2.300 by 0.193: measure grey levels"),
+        (0.807, None, None, "fringes contradict a table by 0.193"),
+    ],
+)
+def test_without_levels_fringes_never_overrule_what_the_rig_claims(
+    exponent: float, given: float | None, response: dict[str, Any] | None, said: str
+) -> None:
+    found = Response(exponent, 0.003, None if given is None else given * exponent, 0.1, 0.1, 0.01, 900)
+    told, lines = checked(found, None)
+    assert told == response
+    assert said in lines[-1]
+
+
+def test_what_the_poses_lack_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = sight_at(0)
+    guide = Guide(TARGET, SIZE, (Seen("01", one.ids, one.points),))
+    calibrate_run._say_lacking(guide)
+    said = capsys.readouterr().err
+    assert said.startswith("not met of what a calibration asks for: ")
+    assert "depths span 0.0% of the first pose's (15% are asked)" in said
+    assert f"no points in {9 - int(guide.fields().sum())} of 9 fields" in said
+    calibrate_run._say_lacking(None)
+    assert capsys.readouterr().err == ""
 
 
 def test_the_response_is_measured_before_the_first_pose(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -206,16 +263,22 @@ def test_the_response_is_measured_before_the_first_pose(monkeypatch: pytest.Monk
         'device = "quick/board"\n'
     )
     config, stages = load_rig(str(file)), list[str]()
-    assert first_response(config, VirtualClock(), stages.append) == (
-        None,
-        "response: undone as the rig's calibration has it",
-    )
+    claims = SimpleNamespace(precorrection=Precorrection(gamma=1.8))
+    monkeypatch.setattr("service.scan_setup.OpenRig.known", claims)
+    found, words = first_response(config, VirtualClock(), stages.append)
+    assert found is not None
+    assert found.gamma == pytest.approx(2.3, abs=0.03)
+    assert words.endswith("instead of gamma 1.8000, which the rig's calibration has")
     unknown = SimpleNamespace(precorrection=None)
     monkeypatch.setattr("service.scan_setup.OpenRig.known", unknown)
     found, words = first_response(config, VirtualClock(), stages.append)
     assert found is not None
     assert found.gamma == pytest.approx(2.3, abs=0.03)
-    assert "grey levels on what is in view" in words
+    assert words.endswith("grey levels on what is in view; scans will undo it")
     assert stages[-1] == "measuring levels"
     monkeypatch.setattr("service.response_measure.LEVELS", (0, 255))
-    assert first_response(config, VirtualClock(), stages.append)[1].startswith("response: not told by grey levels (")
+    words = first_response(config, VirtualClock(), stages.append)[1]
+    assert words.startswith("response: not told by grey levels (")
+    assert words.endswith("the first pose's fringes will")
+    monkeypatch.setattr("service.scan_setup.OpenRig.known", claims)
+    assert first_response(config, VirtualClock(), stages.append)[1].endswith("what the rig's calibration has stays")

@@ -245,6 +245,15 @@ def test_verify_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         assert words in " ".join(capsys.readouterr().err.split())
     ball_folder = str(save(tmp_path / "ball", ball(noise_mm=0.01)))
     assert main(["calibrate", "verify", ball_folder, "--sphere", "50", "--tolerance", "0.2"]) == 0
+    shown = capsys.readouterr()
+    assert "not told, in none of these figures" in " ".join(shown.out.split())
+    assert "that ignores the scans' systematic uncertainty (which the scans do not tell)" in shown.err
+    budget = {"format": "fringed-report", "version": 1, "uncertainty": {"systematic_mm": 0.29}}
+    (tmp_path / "ball" / "report.json").write_text(json.dumps(budget))
+    assert main(["calibrate", "verify", ball_folder, "--sphere", "50", "--tolerance", "0.2"]) == 0
+    shown = capsys.readouterr()
+    assert "0.2900 mm of depth (1 sigma), in none of these figures" in " ".join(shown.out.split())
+    assert "uncertainty (0.2900 mm of depth, 1 sigma)" in shown.err
     albedo, xyz = scanned_target()
     row = str(save(tmp_path / "target", xyz, albedo.astype(np.float32)))
     capsys.readouterr()
@@ -285,6 +294,15 @@ def test_marks_are_kept_and_verified(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert main(["calibrate", "verify", str(after), "--marks", str(file), "--tolerance", "0.1", "--json"]) == 1
     found = json.loads(capsys.readouterr().out)
     assert found["largest_error_mm"] == pytest.approx(0.4, abs=0.02)
+    assert main(["calibrate", "verify", str(after), "--marks", str(file)]) == 0
+    assert "seen" in capsys.readouterr().out
+    alone = tmp_path / "plate.json"
+    assert main(["calibrate", "marks", str(before), "-o", str(alone), "--plate", "140,100,120,60"]) == 0
+    capsys.readouterr()
+    assert main(["calibrate", "verify", str(after), "--marks", str(alone)]) == 0
+    shown = capsys.readouterr().out
+    assert "plate offset mm" in shown
+    assert "seen" not in shown
 
 
 def test_mcp_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

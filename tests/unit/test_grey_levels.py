@@ -45,6 +45,20 @@ def test_an_exponent_is_found_again(gamma):
     assert found.pixels == 60 * 71
 
 
+def test_an_exponent_is_no_surer_than_rounding_lets_it_be():
+    """Without noise and texture all pixels are rounded alike, and the fit's own remainder may come out as nothing."""
+    albedo = np.ones(SHAPE)
+    told = []
+    for white in range(60, 240, 20):
+        frames = [np.rint(albedo * white * v / 255).astype(np.uint8) for v in LEVELS]
+        found = response_of_levels(LEVELS, frames, 255)
+        told.append((found.gamma - 1) / found.sigma)
+        assert 0.2 / white < found.sigma < 1.0 / white
+    assert np.abs(told).max() < 3
+    sixteen = [np.full(SHAPE, 200 * v, np.uint16) for v in LEVELS]
+    assert response_of_levels(LEVELS, sixteen, 65535).sigma == 1e-4  # four decimals are kept
+
+
 def test_another_response_comes_as_a_table_that_undoes_it():
     found = response_of_levels(LEVELS, shots(bent), 255)
     table = found.response["table"]

@@ -1,0 +1,73 @@
+"""What the fringes of a printed target say of a projector's response: a check, and what is to be said of it.
+
+Grey levels decide (`response_measure`). Only where nobody could show them, and the rig claims no response, is the
+fringes' exponent better than none. Nothing is measured here.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from scanner.calibration.grey_levels import LevelResponse
+from scanner.calibration.response import Response
+
+PRINT_BIAS = 0.03
+"""Bound on the share by which fringes on a print tell an exponent wrong. Prints of the simulator (ChArUco, squares of
+30 mm) told 0.983 for 1.000, 0.807 for 0.826 and 1.863 for 1.900, each 1.7 to 2.3 % low; rounded up. On plain surfaces
+there is no such bias."""
+
+
+def expanded(found: Response) -> float:
+    """Uncertainty of the exponent, k = 2: noise, and the bound on the bias added to it (JCGM 100:2008, F.2.4.5)."""
+    return 2 * found.sigma + PRINT_BIAS * found.exponent
+
+
+def checked(found: Response, levels: LevelResponse | None) -> tuple[dict[str, Any] | None, tuple[str, ...]]:
+    """Compare the fringes' exponent with what is known better.
+
+    Args:
+        found: of the first pose.
+        levels: the response by grey levels; None where they were not measured.
+
+    Returns:
+        `response.projector` of a calibration file where only fringes tell it, else None; and the lines to say.
+    """
+    unsure = expanded(found)
+    seen = (
+        f"response by the target's fringes, a check: light follows what is projected to the power of "
+        f"{found.exponent:.3f} +- {unsure:.3f} (k = 2, {PRINT_BIAS:.0%} of it for print)"
+    )
+    if levels is not None:
+        return None, (f"{seen}; the file has what grey levels told", *_against_levels(found, levels, unsure))
+    off = abs(found.exponent - 1) > unsure
+    if found.gamma is None or found.gamma != found.exponent:
+        claim = "a table" if found.gamma is None else f"gamma {found.gamma / found.exponent:.3f}"
+        kept = f"{seen}; the poses were projected with {claim}, which stays"
+        if not off:
+            return None, (kept,)
+        return None, (
+            kept,
+            f"fringes contradict {claim} by {abs(found.exponent - 1):.3f}: measure grey levels, which decide "
+            "(fringed calibrate response)",
+        )
+    if not off:
+        return None, (f"{seen}; nothing to correct",)
+    return {"gamma": found.gamma, "table": None}, (
+        f"{seen}; ripple {found.ripple_px:.3f} px; scans will project with gamma {found.gamma:.3f}, as nothing tells "
+        "it better: measure grey levels (fringed calibrate response)",
+    )
+
+
+def _against_levels(found: Response, levels: LevelResponse, unsure: float) -> tuple[str, ...]:
+    """What to say where both differ by more than both are unsure of."""
+    # What is left to see under a capture's own precorrection; under a table, which is right, nothing.
+    given = None if found.gamma is None else found.gamma / found.exponent
+    expected = 1.0 if given is None else levels.gamma / given
+    apart = abs(found.exponent - expected)
+    allowed = unsure + 2 * levels.sigma * expected / levels.gamma
+    if apart <= allowed:
+        return ()
+    return (
+        f"fringes contradict grey levels: they should have told {expected:.3f}, and {apart:.3f} is more than the "
+        f"{allowed:.3f} that both are unsure of: fringes are blurred, the response is no exponent, or it has changed",
+    )
