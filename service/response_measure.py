@@ -54,14 +54,19 @@ def first_response(config: RigConfig, clock: Clock, stage: Callable[[str], None]
     finally:
         opened.close()
     words = f"gamma {found.gamma:.4f} +- {found.sigma:.4f}" if "gamma" in found.response else "a table"
-    instead = "" if claimed is None else f", instead of {_named(claimed)}, which the rig's calibration has"
+    instead = "" if claimed is None else _beside(claimed, found)
     return found, (
         f"response: {words}, by {len(found.levels)} grey levels on what is in view; scans will undo it{instead}"
     )
 
 
-def _named(claimed: Precorrection) -> str:
-    return "a table" if claimed.gamma is None else f"gamma {claimed.gamma:.4f}"
+def _beside(claimed: Precorrection, found: LevelResponse) -> str:
+    """What the rig's calibration has, beside what grey levels tell."""
+    if claimed.gamma is None:
+        return ", in place of the table that the rig's calibration has"
+    if "gamma" in found.response and abs(found.gamma - claimed.gamma) <= 2 * found.sigma:
+        return f", which agrees with the rig's calibration (gamma {claimed.gamma:.4f})"
+    return f": the rig's calibration is wrong, it has gamma {claimed.gamma:.4f}"
 
 
 def _measured(opened: OpenRig, clock: Clock, stage: Callable[[str], None]) -> LevelResponse:

@@ -263,12 +263,16 @@ def test_the_response_is_measured_before_the_first_pose(monkeypatch: pytest.Monk
         'device = "quick/board"\n'
     )
     config, stages = load_rig(str(file)), list[str]()
+    assert (
+        "which agrees with the rig's calibration (gamma 2.3000)"
+        in first_response(config, VirtualClock(), stages.append)[1]
+    )
     claims = SimpleNamespace(precorrection=Precorrection(gamma=1.8))
     monkeypatch.setattr("service.scan_setup.OpenRig.known", claims)
     found, words = first_response(config, VirtualClock(), stages.append)
     assert found is not None
     assert found.gamma == pytest.approx(2.3, abs=0.03)
-    assert words.endswith("instead of gamma 1.8000, which the rig's calibration has")
+    assert words.endswith("scans will undo it: the rig's calibration is wrong, it has gamma 1.8000")
     unknown = SimpleNamespace(precorrection=None)
     monkeypatch.setattr("service.scan_setup.OpenRig.known", unknown)
     found, words = first_response(config, VirtualClock(), stages.append)
