@@ -38,7 +38,9 @@ def option_problems(model: type[Options], options: Mapping[str, Any], device: st
     try:
         model.model_validate(dict(options))
     except ValidationError as error:
-        found = {_key(detail): _error_of(detail, model, device) for detail in error.errors(include_url=False)}
+        found: dict[str, ConfigError] = {}
+        for detail in error.errors(include_url=False):  # of one option the first error: others follow from it
+            found.setdefault(_key(detail), _error_of(detail, model, device))
         return list(found.items())
     return []
 
@@ -49,14 +51,36 @@ def _key(detail: ErrorDetails) -> str:
 
 
 def _error_of(detail: ErrorDetails, model: type[Options], device: str) -> ConfigError:
-    key = ".".join(str(part) for part in detail["loc"])
+    key = ".".join(part for part in detail["loc"] if isinstance(part, str))
     if detail["type"] == "extra_forbidden":
         known = sorted(model.model_fields)
         near = get_close_matches(key, known, n=1)
         suggestion = f"did you mean {near[0]!r}? " if near else ""
         return ConfigError(f"unknown option {key!r}", device=device, hint=f"{suggestion}known: {', '.join(known)}")
     return ConfigError(
-        f"option {key or 'table'}: {detail['msg']}, got {detail['input']!r}",
+        f"option {key or 'table'}: {_expected(detail)}, got {detail['input']!r}",
         device=device,
         hint="the driver's page in docs/how-to lists its options",
     )
+
+
+_WORDS = (
+    ("Input should be ", "takes "),
+    ("Value error, ", ""),
+    ("a valid tuple", "a list"),
+    ("a valid list", "a list"),
+    ("a valid dictionary", "a table"),
+    ("Field required", "is missing"),
+)
+
+
+def _expected(detail: ErrorDetails) -> str:
+    """What fits, in a rig file's words: it knows lists, and neither tuples nor fields."""
+    if detail["type"] == "too_short":
+        return f"takes a list of {detail['ctx']['min_length']} or more"
+    if detail["type"] == "too_long":
+        return f"takes a list of {detail['ctx']['max_length']} at most"
+    said = detail["msg"]
+    for theirs, ours in _WORDS:
+        said = said.replace(theirs, ours)
+    return said

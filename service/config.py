@@ -19,7 +19,7 @@ from pydantic_core import ErrorDetails
 
 from drivers.registry import Kind, check_driver
 from scanner.errors import ConfigError
-from service.rig_model import CameraConfig, ProjectorConfig, RigConfig, RigSettings, Table
+from service.rig_model import SAID, CameraConfig, ProjectorConfig, RigConfig, RigSettings, Table
 from service.toml_errors import syntax_problems
 from service.toml_lines import KeyPath, key_lines
 from service.toml_text import to_toml
@@ -180,7 +180,7 @@ def _problems(
             expected = f"is missing: expected {_description(path)}"
             value = None
         else:
-            expected = f"expected {_description(path)}"
+            expected = detail["msg"] if detail["type"] == SAID else f"expected {_description(path)}"
             value = _value_at(content, path)
         yield Problem(file, _line_of(path, lines), ".".join(str(key) for key in path), value, expected)
 
@@ -304,10 +304,10 @@ def _read(path: Path) -> str:
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise ConfigError(f"{path} is larger than a rig file can be", hint="is it another file?")
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # some editors write a byte order mark: it is no text
     except FileNotFoundError as error:
         raise ConfigError(f"there is no rig file {path}", hint="--rig simulated needs no file") from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not text in UTF-8, so it is no rig file") from error
+        raise ConfigError(f"{path} is not text in UTF-8, so it is no rig file", hint="save it as UTF-8") from error
     except OSError as error:
         raise ConfigError(f"cannot read {_cut(str(path))}: {error.strerror}") from error

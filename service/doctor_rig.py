@@ -82,7 +82,7 @@ def host(opened: OpenRig, clock: Clock) -> Iterator[Finding]:
             level = Level.OK if found.ok else Level.BAD
             yield Finding(found.subject, level, found.text, found.command or ("" if found.ok else SMALLER))
     stamp = camera.capabilities.stamp
-    said = f"frames are stamped by {stamp.value}, true within {camera.capabilities.stamp_bound_ns / 1e6:.2f} ms"
+    said = f"frames are stamped by {stamp.value}, true within {camera.capabilities.stamp_bound_ns / 1e3:.4g} us"
     if stamp is Source.ESTIMATED:
         mend = "nothing is proved by estimates; the driver's page of the documentation says how to measure its stamps"
         yield Finding("stamps", Level.NOTE, said, mend)

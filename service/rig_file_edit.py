@@ -33,8 +33,9 @@ def set_values(path: Path, table: str, values: Mapping[str, Value]) -> Path:
         before = path.read_bytes()
         if not os.access(path, os.W_OK) or not path.stat().st_mode & 0o200:
             raise StorageError(f"{path} is read-only", hint=f"write into its [{table}]: {_words(values)}")
-    after = _changed(before.decode(), table, values)
-    if after is None or not _is(before.decode(), after, table, values):
+    text = before.decode("utf-8-sig")
+    after = _changed(text, table, values)
+    if after is None or not _is(text, after, table, values):
         raise ConfigError(f"{path} cannot be changed by line", hint=f"write into its [{table}]: {_words(values)}")
     kept = path.with_name(path.name + ".before")
     replace_file(kept, before)

@@ -9,10 +9,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
+from pydantic_core import PydanticCustomError
 
 from scanner.errors import ScannerError
 from scanner.wire import DEFAULT_ENDPOINT, ipc_path
 from service.toml_text import to_toml
+
+SAID = "said"
+"""Type of an error whose words are for the reader as they stand"""
 
 
 def _range(value: Any) -> Any:
@@ -21,7 +25,7 @@ def _range(value: Any) -> Any:
         return (float(value), float(value))
     if isinstance(value, list | tuple) and len(value) == 2 and all(type(v) in (int, float) for v in value):
         if value[0] > value[1]:
-            raise ValueError("upside down")
+            raise PydanticCustomError(SAID, "the wrong way round: a range is [low, high], the smaller number first")
         return (float(value[0]), float(value[1]))
     return value
 

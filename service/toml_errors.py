@@ -6,6 +6,7 @@ again, so that one look finds them all. What the keys mean is not known here.
 
 from __future__ import annotations
 
+import ast
 import re
 import tomllib
 from collections.abc import Callable, Sequence
@@ -18,6 +19,7 @@ WIDEST = 96
 """Characters of a line that are shown, around the error"""
 
 _PLACE = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
+_KEY = re.compile(r"""(?<= )\(["'].*\)(?= twice$|$)""")
 _SPANNING = ("Unclosed array", "Unterminated string", 'Expected "', "Cannot declare")
 _HEADER = re.compile(r"\s*\[?\[?\s*([\w-]+(?:\.[\w-]+)*)\s*\]?\]?\s*(?:#.*)?")
 _TABLE = re.compile(r"\s*\[\s*[\w-]+(?:\.[\w-]+)*\s*\]\s*(?:#.*)?")
@@ -94,6 +96,7 @@ def _problem(error: str, lines: Sequence[str]) -> SyntaxProblem:
         line, column = _opening(said, lines, line, column)
     if said.startswith("Cannot overwrite") and line > 1 and not lines[line - 1].strip():
         line, column = line - 1, 1
+    said = _KEY.sub(lambda key: ".".join(ast.literal_eval(key[0])), said)  # the parser shows a dotted key as a tuple
     return SyntaxProblem(line, column, said, _likely(said, lines, line, column), lines[line - 1])
 
 
@@ -153,10 +156,12 @@ def _likely_value_and_more(text: str, here: str) -> str:
     key, value = key.strip(), value.partition("#")[0].strip()
     numbers = re.fullmatch(rf"{_NUMBER}\s*,\s*{_NUMBER}(\s*,\s*{_NUMBER})*", value)
     fraction = f"; a fraction has a point: {value.replace(',', '.')}" if re.fullmatch(r"\d+,\d+", value) else ""
+    thousands = re.fullmatch(r"[+-]?[1-9]\d{0,2}(,\d{3})+", value)
     unit = re.fullmatch(rf"({_NUMBER})\s*[A-Za-zµ%]+", value)
     quoted = value.startswith(('"', "'"))
     cases = (
         (here.startswith((";", "//")), _ONLY_COMMENTS),
+        (thousands, f"nothing stands between thousands: {key} = {value.replace(',', '')}; or several: [{value}]"),
         (numbers, f"several numbers stand in brackets: {key} = [{value}]{fraction}"),
         (re.match(r"0\d", value), f"a number has no zeros before it: {value.lstrip('0') or '0'}"),
         (re.fullmatch(r"\d+\.", value), f"a number ends with a digit: {value}0"),

@@ -92,7 +92,9 @@ class Capture:
             DecodeError: the name leads out of the folder.
         """
         name = self.header.calibration
-        return _inside(self.path, name) if name is not None and name.endswith(".json") else None
+        if name is None or not name.endswith(".json"):
+            return None
+        return _inside(self.path, name, hint="copy the calibration into the folder, or give it with --calibration FILE")
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -274,14 +276,12 @@ def _within_range(frame: Pixels, camera: CameraFormat, name: str) -> Pixels:
     return frame
 
 
-def _inside(folder: Path, name: str) -> Path:
+def _inside(folder: Path, name: str, hint: str = "paths are relative to the folder") -> Path:
     try:
         path = (folder / name).resolve()
         path.exists()
     except (OSError, ValueError, RuntimeError) as error:
         raise DecodeError(f"{folder}: {name!r:.80} is no file name: {error!s:.80}") from error
     if not path.is_relative_to(folder.resolve()):
-        raise DecodeError(
-            f"{folder}: {name!r} leads out of the capture folder", hint="paths are relative to the folder"
-        )
+        raise DecodeError(f"{folder}: {name!r} leads out of the capture folder", hint=hint)
     return path

@@ -21,7 +21,8 @@ def check_config(
 ) -> int:
     """Check a rig file: keys, values, drivers and their options, scenes, modes, calibration. Opens no device.
 
-    All problems are named at once. What only a device can say, fringed doctor FILE finds.
+    All problems are named at once; where the syntax of several lines is broken, what they should say comes after it is
+    mended. What only a device can say, fringed doctor FILE finds.
 
     \b
     Examples:

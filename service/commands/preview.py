@@ -45,8 +45,9 @@ def preview(
 ) -> int:
     """Look through the camera while the projector shows white. Ctrl-C ends it.
 
-    Twice a second a picture file is written anew (open it in a viewer that follows changes), and a line tells how
-    bright and how sharp it is. Aim; open the lens as far as nothing saturates; turn the focus to the most sharpness.
+    Twice a second a picture file is written anew (open it in a viewer that follows changes); a line tells how bright
+    and how sharp it is, whenever that changes. Aim; open the lens as far as nothing saturates; turn the focus to the
+    most sharpness.
 
     \b
     mean       of all pixels, share of the camera's range
@@ -70,7 +71,7 @@ def preview(
     from scanner.storage import try_file  # noqa: PLC0415
 
     try_file(picture)
-    watching = _Watching(picture)
+    watching = Watching(picture)
     with progress_lines() as lines, rig_daemon(rig, connect, lines) as endpoint:
         lines.stage("preparing")
         with Client(endpoint, name="fringed preview") as client:
@@ -90,7 +91,7 @@ def preview(
     return 0
 
 
-class _Watching:
+class Watching:
     """Reads pictures; writes the newest and its figures now and then."""
 
     def __init__(self, path: Path) -> None:
@@ -99,8 +100,10 @@ class _Watching:
         self._path = path
         self._next = 0.0
         self._best = 0.0
+        self._said = ""
 
     def all(self, pictures: Iterator[CameraPicture], bits: int, line: Callable[[str], None]) -> None:
+        """Until they end. line: is given each line that differs from the one before."""
         for picture in pictures:
             self.seen += 1
             if time.monotonic() >= self._next:
@@ -108,7 +111,10 @@ class _Watching:
                 self.figures = picture.figures(bits)
                 self._best = max(self._best, self.figures["sharpness"])
                 write_picture(self._path, picture, bits)
-                line(words(self.figures, self._best))
+                said = words(self.figures, self._best)
+                if said != self._said:  # a view at rest says so once
+                    line(said)
+                self._said = said
 
 
 def words(figures: Mapping[str, float], best: float) -> str:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
 from scanner.camera_picture import CameraPicture, sharpness
 from scanner.wire_images import PreviewHeader, encode_image
+from service.commands import preview as command
 
 
 def picture(blur_px: float, noise: float = 0.0, level: float = 1.0) -> np.ndarray:
@@ -46,3 +49,14 @@ def test_sharpness_is_highest_in_focus_whatever_brightness_and_noise() -> None:
     assert sharpness(picture(1.0, level=0.5)) == pytest.approx(sharpness(picture(1.0)), rel=0.02)
     assert sharpness(np.zeros((50, 50), np.uint8)) == 0
     assert sharpness(np.random.default_rng(1).normal(100, 5, (200, 200)).round().astype(np.uint8)) < 2
+
+
+def test_the_line_of_a_preview_is_written_when_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "LINE_S", 0.0)
+    levels = (300, 300, 300, 900, 900, 300)
+    pictures = [CameraPicture.of(message(n, np.full((8, 8), level, np.uint16)), None) for n, level in enumerate(levels)]
+    lines: list[str] = []
+    watching = command.Watching(tmp_path / "now.png")
+    watching.all(iter(pictures), 10, lines.append)
+    assert [line.split()[1] for line in lines] == ["29%", "88%", "29%"]
+    assert watching.seen == len(levels)

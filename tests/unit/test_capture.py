@@ -235,6 +235,14 @@ def test_a_bad_image_is_named(tmp_path: Path, spoil: object, says: str) -> None:
     assert "1.png" in str(error.value)
 
 
+def test_a_calibration_elsewhere_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    names = write_images(tmp_path / "c", [frame(0), frame(1), frame(2)])
+    capture = Capture.open(image_capture(tmp_path / "c", names, calibration="../rig.json"))
+    with pytest.raises(DecodeError, match="leads out of") as error:
+        _ = capture.calibration_path
+    assert "--calibration" in (error.value.hint or "")
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

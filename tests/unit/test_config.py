@@ -1,5 +1,6 @@
 """Rig files: what is accepted, and how everything else is named with its file, line, key, value and expectation."""
 
+import re
 import subprocess
 import sys
 import tomllib
@@ -13,6 +14,16 @@ from hypothesis import strategies as st
 
 from scanner.errors import ConfigError
 from service.config import RigConfig, check_rig, load_rig
+from service.rig_file_edit import set_values
+from service.rig_model import (
+    CameraConfig,
+    CameraSettingsConfig,
+    DaemonConfig,
+    ProjectorConfig,
+    RetentionConfig,
+    RigSettings,
+    TriggerConfig,
+)
 from service.toml_lines import key_lines
 from service.toml_text import to_toml
 
@@ -159,6 +170,7 @@ def test_all_errors_come_at_once_in_order_of_lines(rig_file: Path) -> None:
         ("camera.settings", 'trigger_mode = "hard"', '"software" or "free"'),
         ("projector", 'mode = "big"', "1920x1080@60"),
         ("projector", "settle_us = inf", "microseconds"),
+        ("projector", "settle_us = [24000, 20000]", "the wrong way round: a range is [low, high]"),
         ("projector", "dwell = 1.5", "refreshes"),
         ("projector", "rotate = 90", "upside down"),
         ("projector", "options = 3", "driver's own options"),
@@ -211,6 +223,13 @@ def test_files_that_are_no_rig_files(rig_file: Path, tmp_path: Path) -> None:
         load_rig(tmp_path)
 
 
+def test_a_byte_order_mark_is_no_text(rig_file: Path) -> None:
+    rig_file.write_bytes(b"\xef\xbb\xbf" + b'[camera]\ndriver = "simulated"\n[projector]\ndriver = "simulated"\n')
+    assert load_rig(rig_file).camera.driver == "simulated"
+    set_values(rig_file, "camera", {"device": "quick/board"})
+    assert load_rig(rig_file).camera.device == "quick/board"
+
+
 def test_problems_are_plain_data(rig_file: Path) -> None:
     rig_file.write_text("camera.driver = 4\n")
     rig, problems = check_rig(rig_file)
@@ -224,6 +243,17 @@ def test_problems_are_plain_data(rig_file: Path) -> None:
 def test_the_example_rig_file_is_a_good_one() -> None:
     example = Path(__file__).parents[2] / "docs" / "examples" / "rig.toml"
     assert load_rig(example).projector.driver == "simulated"
+    words = set(re.findall(r"^(?:# )?(\w+) = ", example.read_text(), flags=re.MULTILINE))
+    models = (
+        RigSettings,
+        CameraConfig,
+        CameraSettingsConfig,
+        ProjectorConfig,
+        TriggerConfig,
+        DaemonConfig,
+        RetentionConfig,
+    )
+    assert {key for model in models for key in model.model_fields} - words == {"settings", "options", "retention"}
 
 
 def test_processes_start_without_array_libraries() -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -274,3 +275,13 @@ def test_gamma_is_measured(gamma: float) -> None:
     assert found.gamma_misfit < 0.01
     assert found.flicker < 0.002
     assert found.lit_share > 0.95
+
+
+def test_stamps_say_their_bound_however_small() -> None:
+    clock = VirtualClock()
+    with_stamps = open_camera("simulated", "quick/board", {}, clock)
+    for bound_ns, said in ((1_500, "1.5 us"), (250_000, "250 us")):
+        capabilities = replace(with_stamps.capabilities, stamp_bound_ns=bound_ns)
+        opened: Any = SimpleNamespace(rig=SimpleNamespace(camera=SimpleNamespace(capabilities=capabilities)))
+        assert f"true within {said}" in one(list(doctor_rig.host(opened, clock)), "stamps").says
+    with_stamps.close()

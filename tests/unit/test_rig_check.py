@@ -119,3 +119,23 @@ def test_simulated_devices_of_two_worlds_are_odd(tmp_path: Path) -> None:
     camera, projector = (f'{{ driver = "simulated", device = "quick/{scene}" }}' for scene in ("board", "bust"))
     _, warnings = look(tmp_path, f"camera = {camera}\nprojector = {projector}\n")
     assert "'quick/board', 'quick/bust'" in warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("outputs", "said"),
+    [
+        ('["CAM1", "CAM9"]', "option outputs: takes 'CAM1', 'CAM2', 'SYNC' or 'LED', got 'CAM9'"),
+        ("[]", "option outputs: takes a list of 1 or more"),
+        ('"CAM1"', "option outputs: takes a list, got 'CAM1'"),
+    ],
+)
+def test_a_list_that_does_not_fit_is_told_in_the_files_own_words(tmp_path: Path, outputs: str, said: str) -> None:
+    (problem,), _ = look(
+        tmp_path,
+        f"""
+        camera.driver = "simulated"
+        projector.driver = "simulated"
+        trigger = {{ driver = "serial", options = {{ outputs = {outputs} }} }}
+        """,
+    )
+    assert said in problem

@@ -26,6 +26,7 @@ from service.toml_errors import syntax_problems
         ("gain_db = 5.", (1, 12), "a number ends with a digit: 5.0"),
         ("gain_db = 007", (1, 12), "no zeros before it: 7"),
         ("gain_db = 1,5", (1, 12), "gain_db = [1,5]; a fraction has a point: 1.5"),
+        ("exposure_us = 20,000", (1, 17), "exposure_us = 20000; or several: [20,000]"),
         ("latency_us = 3000, 5000", (1, 18), "latency_us = [3000, 5000]"),
         ("latency_us = 4 ms", (1, 16), "without its unit, which is in the key's name: latency_us = 4"),
         ("region = (0, 0, 2, 2)", (1, 10), "square brackets"),
@@ -67,6 +68,16 @@ def test_the_caret_stands_below_the_place() -> None:
         assert shown[caret.index("^") :].startswith("nobody") or before.startswith("\t")
         assert caret.count("\t") == before.count("\t")
         assert len(shown) < 110
+
+
+def test_a_key_is_shown_as_it_is_written() -> None:
+    for text, said in (
+        ("[camera]\n[camera]", "Cannot declare camera twice"),
+        ("[a.'b)']\n[a.'b)']", "Cannot declare a.b) twice"),
+        ("a = {}\na.b = 1", "Cannot mutate immutable namespace a"),
+    ):
+        (found,), _ = syntax_problems(text)
+        assert found.said == said
 
 
 def test_signs_that_steer_a_terminal_are_not_shown() -> None:
