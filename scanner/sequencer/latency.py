@@ -33,6 +33,9 @@ MIN_CONTRAST_SIGMAS = 20.0
 COARSE, FINE = 1, 10
 """Flips sampled all through to find the change, and flips sampled at its two ends."""
 
+EARLIER_NS = 1_000_000
+"""An exposure that shall be over before a moment is asked for this much earlier: a host that wakes late is late."""
+
 
 @dataclass(frozen=True)
 class _Sample:
@@ -105,10 +108,12 @@ def disagreement(
     settings: CameraSettings | None = None,
     trigger_mode: TriggerMode | None = None,
 ) -> Disagreement | None:
-    """Look at one flip, a third of a second, and measure in earnest where it contradicts `given` (latency, settle).
+    """Look at a flip or two, half a second, and measure in earnest where they contradict `given` (latency, settle).
 
     Contradicted is what cannot be: light before the least latency, darkness after the largest, change after both. A
-    display that jitters within what is given is not.
+    display that jitters within what is given is not. The first flip is seen as often as the camera can; where it was
+    dark, then lit, and the least latency lies between, the second is seen once, just before the least latency: one
+    that is too long by more than an exposure and `EARLIER_NS` is found out.
 
     Raises:
         ConfigError, SyncError, DeviceError: see `measure`.
@@ -117,17 +122,26 @@ def disagreement(
     with Shots(projector, camera, clock, settings=settings, trigger_mode=trigger_mode, light_delay_ns=longest) as shots:
         scale = _Scale(shots, _exposure(shots, projector.capabilities.refresh_ns))
         samples = _burst(shots, scale, 0, longest)
+        began, least = _began(samples, longest), given[0].low_ns
+        before = least - _length(samples) - 4 * samples[0].bound_ns - EARLIER_NS
+        if before > 0 and began.low_ns < least <= began.high_ns:
+            samples += _burst(shots, scale, before, 0)
         shots.show(BLACK)
-    began = Interval(
-        max((s.end_ns for s in samples if s.dark), default=0),
-        min((s.end_ns + 2 * s.bound_ns for s in samples if not s.dark), default=longest),
-    )
+    began = _began(samples, longest)
     changing = max((s.start_ns - 2 * s.bound_ns for s in samples if not s.full and not s.dark), default=0)
     if not _off(given, began, changing):
         return None
     latency, settle = measure(projector, camera, clock, settings=settings, trigger_mode=trigger_mode)
     off = _off(given, latency, latency.low_ns + settle.low_ns)
     return Disagreement(latency, settle, off) if off else None
+
+
+def _began(samples: Sequence[_Sample], longest: int) -> Interval:
+    """When light began: behind the last exposure that was dark, before the end of the first that was not."""
+    return Interval(
+        max((s.end_ns for s in samples if s.dark), default=0),
+        min((s.end_ns + 2 * s.bound_ns for s in samples if not s.dark), default=longest),
+    )
 
 
 def _off(given: tuple[Interval, Interval], began: Interval, changing_ns: int) -> int:

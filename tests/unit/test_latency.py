@@ -11,7 +11,7 @@ import pytest
 
 from drivers.registry import open_camera, open_projector
 from scanner.clock import VirtualClock
-from scanner.devices import Interval, TriggerMode
+from scanner.devices import CameraCapabilities, Interval, TriggerMode
 from scanner.errors import ConfigError, SyncError
 from scanner.sequencer import measure_latency
 from scanner.sequencer.latency import Disagreement, disagreement
@@ -121,3 +121,15 @@ def test_a_latency_that_may_be_the_projectors_is_believed(
     found, seconds = against(given_ms, projector)
     assert found is None
     assert seconds < 0.6
+
+
+@pytest.mark.parametrize("given_ms", [(9, 10, 0, 1), (15, 15, 0, 1), (20, 20, 0, 1)])
+@pytest.mark.parametrize("modulation", ["none", "pwm"])
+def test_one_too_long_by_a_few_milliseconds_is_named_however_seldom_the_camera_looks(
+    given_ms: tuple[float, float, float, float], modulation: str
+) -> None:
+    slow = CameraCapabilities.min_period_ns
+    with patch.object(CameraCapabilities, "min_period_ns", lambda caps, exposure: slow(caps, exposure) + 16_000_000):
+        found, _ = against(given_ms, {"latency_us": 4200.0, "settle_us": 200.0, "modulation": modulation})
+    assert found is not None
+    assert found.off_ns == pytest.approx(1e6 * (given_ms[0] - 4.5), abs=1.2e6)
