@@ -60,6 +60,7 @@ def report_of(
             "points_of_lit": share(points, lit),
             "undecided_of_lit": share(lit - values, lit),
             "too_dark": share(pixels - lit, pixels),
+            "saturated_of_lit": share(counts[Reason.CLIPPED], lit),
         },
         "removed": dict(removed),
         "filters": settings.as_dict(),

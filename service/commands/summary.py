@@ -12,6 +12,9 @@ from service.terminal import print_error, print_facts, print_json
 LEAST_S = 0.1
 """Stages shorter than this are not listed."""
 
+LEAST_SATURATED = 0.0005
+"""A share that is not printed as 0.0 %"""
+
 _FILES = (
     ("picture", "preview.png"),
     ("error map", "error_map.png"),
@@ -77,7 +80,7 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _coverage(report: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """How much has a value, of what; and how much is too dark to have one. Of all that is lit where truth tells it."""
+    """How much has a value, of what; how much is too dark, or too bright. Of all that is lit where truth tells it."""
     coverage = report.get("coverage") or {}
     if (shown := coverage.get("lit")) is None:
         return []
@@ -90,11 +93,18 @@ def _coverage(report: Mapping[str, Any]) -> list[tuple[str, str]]:
             f"{truth['coverage']:.1%} of all that the projector lights (truth); {truth['too_dark_share']:.1%} of it is "
             f"too dark to show the pattern, {truth['undecided_share']:.1%} undecided"
         )
-        return [("coverage", whole), ("", of_shown[1])]
+        return [("coverage", whole), ("", of_shown[1]), *_saturated(coverage)]
     if not (dark := coverage.get("too_dark")):
-        return [of_shown]
+        return [of_shown, *_saturated(coverage)]
     words = f"{dark:.1%} of the image shows no pattern: shadow, a surface that is too dark, or none"
-    return [of_shown, ("too dark", words)]
+    return [of_shown, ("too dark", words), *_saturated(coverage)]
+
+
+def _saturated(coverage: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What has no value because the camera's range ended below it; nothing where that rounds to none."""
+    if (bright := coverage.get("saturated_of_lit", 0.0)) < LEAST_SATURATED:
+        return []
+    return [("saturated", f"{bright:.1%} of the pixels in which the pattern shows: too bright to have a value")]
 
 
 def _frames(capture: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -117,7 +127,11 @@ def _uncertainty(budget: Mapping[str, Any]) -> tuple[str, str] | None:
     unknown = ", ".join(names)
     at = f"at {budget['depth_mm']:.0f} mm"
     if "method" in names:  # what is known is the least of it: no figure of the whole
-        text = f"{budget['random_mm']:.3f} mm random (1 sigma of the median point) {at}"
+        text = (
+            f"at least +-{budget['within_mm']:.3f} mm {at}, of 95 in 100 points; {budget['random_mm']:.3f} mm is the "
+            "random part alone (1 sigma of the median point); the method's own error is not known and larger: "
+            "see docs/explanation/uncertainty.md"
+        )
     else:
         text = (
             f"+-{budget['within_mm']:.3f} mm {at}, of 95 in 100 points: {budget['random_mm']:.3f} mm random "

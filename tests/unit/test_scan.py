@@ -56,6 +56,15 @@ def test_counts_of_the_report_add_up(ball, scan):
     assert report["depth_mm"]["p1"] < report["depth_mm"]["median"] < 761
 
 
+def test_what_is_saturated_is_a_share_of_what_shows_the_pattern(ball):
+    decoded = ball.decoded()
+    reason = decoded.reason.copy()
+    reason.reshape(-1)[np.flatnonzero(ball.lit)[::4]] = Reason.CLIPPED
+    coverage = build_scan(replace(decoded, reason=reason)).report["coverage"]
+    assert coverage["saturated_of_lit"] == pytest.approx(0.25, abs=1e-3)
+    assert coverage["too_dark"] == pytest.approx(1 - ball.lit.mean())
+
+
 def test_stages_before_are_kept_in_the_timings(ball):
     timings = {"decode": 1.5}
     report = build_scan(ball.decoded(), ball.calibration, timings=timings).report

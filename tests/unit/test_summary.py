@@ -81,6 +81,19 @@ def test_what_a_method_adds_unknown_gets_no_figure_of_the_whole(
     (tmp_path / "report.json").write_text(json.dumps(report), encoding="utf-8")
     report_result(tmp_path, 1.0, {}, as_json=False)
     printed = capsys.readouterr().out
-    assert "0.070 mm random (1 sigma of the median point) at 700 mm; unknown, and not in it" in printed
-    assert "calibration, method" in printed
-    assert "+-" not in printed
+    assert "at least +-0.200 mm at 700 mm, of 95 in 100 points" in printed
+    assert "0.070 mm is the random part alone (1 sigma of the median point)" in printed
+    assert "the method's own error is not known and larger: see docs/explanation/uncertainty.md" in printed
+    assert "unknown, and not in it: calibration, method" in printed
+
+
+@pytest.mark.parametrize(("share", "said"), [(0.982, "98.2%"), (0.0006, "0.1%"), (0.0004, None), (0.0, None)])
+def test_coverage_says_what_was_saturated(
+    share: float, said: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    coverage = {"lit": 0.018, "points_of_lit": 0.018, "too_dark": 0.024, "saturated_of_lit": share}
+    (tmp_path / "report.json").write_text(json.dumps({"points": 9, "coverage": coverage}), encoding="utf-8")
+    report_result(tmp_path, 1.0, {}, as_json=False)
+    printed = capsys.readouterr().out
+    assert ("saturated" in printed) == (said is not None)
+    assert said is None or f"{said} of the pixels in which the pattern shows: too bright" in printed

@@ -1,0 +1,78 @@
+"""Overexposure, named: how much of what the projector lights is saturated, and what exposure would not be.
+
+It judges a decoded capture and warns; it chooses no exposure (that is `scanner.sequencer.exposure`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.capture import Capture
+from scanner.capture.exposure import exposure_report
+from scanner.decode import Reason
+from scanner.decode.reasons import tally
+from scanner.patterns import PmpPattern
+
+LARGE = 0.01
+"""Share of what shows the pattern: automatic exposure lets fewer than one pixel in 200 saturate (glints)."""
+
+CLIP = 0.98
+"""Share of the camera's range from which a sample counts as clipped, as the decoders have it."""
+
+AIM = 0.9
+"""Share of that level for what is advised, .88 of the range: between automatic exposure's choices, .95 and less."""
+
+MOST = 10.0
+"""Fringes that are so many times too bright are saturated in eight of ten samples: more cannot be told by counting."""
+
+PERCENTILE = 99.5
+"""Of the pixels' brightness, as automatic exposure has it."""
+
+_EVERY = 8
+
+
+def saturation_warnings(reason: NDArray[np.uint8], capture: Capture) -> tuple[str, ...]:
+    """What to say where more than `LARGE` of the pixels that show the pattern are saturated; () where not.
+
+    Args:
+        reason: (H, W), why each pixel has no value.
+        capture: whose frames these are; it may still be open.
+    """
+    counts = tally(reason)
+    shows = int(counts.sum() - counts[Reason.SHADOW] - counts[Reason.LOW_MODULATION])
+    clipped = int(counts[Reason.CLIPPED])
+    if clipped <= LARGE * shows:
+        return ()
+    report = exposure_report(capture.header) or {}
+    used, mode = report.get("used_us"), report.get("mode")
+    automatic = "" if mode == "auto" else ", or automatically (--exposure auto)"
+    advice = "expose for less" if used is None else _advice(used / 1000, _too_bright(capture))
+    return (
+        f"overexposed: {clipped / shows:.1%} of the pixels in which the pattern shows are saturated and have no value: "
+        f"{advice}{automatic}, lower the gain, or close the lens",
+    )
+
+
+def _advice(used_ms: float, factor: float | None) -> str:
+    if factor is None:
+        return f"expose for half of these {used_ms:.3g} ms at most"
+    return f"expose for {used_ms * AIM / factor:.2g} ms at most (these were {used_ms:.3g})"
+
+
+def _too_bright(capture: Capture) -> float | None:
+    """How many times brighter than `CLIP` the brightest fringes are; None where frames are no sinusoids.
+
+    A fringe (1 + cos) / 2 of height L passes 1 for a share s of its phases, with cos(pi s) = 2 / L - 1: the samples
+    that are saturated, counted, tell a height that none of them shows.
+    """
+    header = capture.header
+    present = [p for p in header.sequence.fringes if p in capture.records]
+    if not isinstance(header.sequence.pattern, PmpPattern) or not present:
+        return None
+    level = CLIP * header.camera.max_value
+    over = np.mean([capture.frame(p)[::_EVERY, ::_EVERY] >= level for p in present], axis=0)
+    share = float(np.percentile(over, PERCENTILE))
+    return min(MOST, 2.0 / max(1e-9, 1.0 + math.cos(math.pi * share)))

@@ -1,0 +1,68 @@
+"""Overexposure is named, with an exposure that would not be."""
+
+from __future__ import annotations
+
+import re
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scanner.capture import Capture
+from scanner.decode import Reason
+from scanner.patterns import GrayPattern, Pattern, PatternSequence, PmpPattern, ProjectorSize
+from scanner.saturation import saturation_warnings
+
+PMP = PmpPattern()
+SIZE = (64, 512)
+
+
+def capture(brightness: float, pattern: Pattern = PMP, exposure: dict[str, Any] | None = None) -> Capture:
+    """Frames of 8 bits whose fringes are `brightness` times full scale high, exposed for 40 ms."""
+    sequence = PatternSequence(ProjectorSize(*SIZE), pattern)
+    header = SimpleNamespace(
+        sequence=sequence,
+        camera=SimpleNamespace(max_value=255),
+        plan={"exposure_ns": 40_000_000},
+        extra={"exposure": exposure or {"mode": "given", "asked_us": 40_000.0}},
+    )
+
+    def frame(position: int) -> Any:
+        return np.minimum(brightness * sequence.image(position).astype(float), 255).astype(np.uint8)
+
+    return SimpleNamespace(header=header, records=dict.fromkeys(range(len(sequence))), frame=frame)
+
+
+def reasons(clipped: float) -> Any:
+    """A quarter of the pixels is in shadow; of the others a share is clipped."""
+    found = np.zeros(1000, np.uint8)
+    found[:250] = Reason.SHADOW
+    found[250 : 250 + round(750 * clipped)] = Reason.CLIPPED
+    return found.reshape(25, 40)
+
+
+@pytest.mark.parametrize("brightness", [1.1, 1.5, 3.0, 6.0])
+def test_the_exposure_that_is_advised_saturates_nothing_and_is_no_dim_one(brightness: float) -> None:
+    (warning,) = saturation_warnings(reasons(0.5), capture(brightness))
+    assert "overexposed: 50.0% of the pixels in which the pattern shows" in warning
+    assert "--exposure auto" in warning
+    advised = re.search(r"expose for ([0-9.]+) ms at most \(these were 40\)", warning)
+    assert advised is not None
+    assert 0.6 < float(advised[1]) / 40 * brightness < 1.0
+
+
+@pytest.mark.parametrize("clipped", [0.0, 0.009])
+def test_glints_are_no_warning(clipped: float) -> None:
+    assert saturation_warnings(reasons(clipped), capture(3.0)) == ()
+
+
+def test_frames_that_are_no_sinusoids_tell_no_brightness() -> None:
+    (warning,) = saturation_warnings(reasons(0.2), capture(3.0, GrayPattern()))
+    assert "expose for half of these 40 ms at most" in warning
+
+
+def test_what_was_exposed_automatically_is_not_told_to_be() -> None:
+    (warning,) = saturation_warnings(reasons(0.2), capture(1.1, exposure={"mode": "auto"}))
+    assert "ms at most" in warning
+    assert "auto" not in warning
