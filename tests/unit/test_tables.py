@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from types import ModuleType
 
@@ -36,6 +37,21 @@ def test_every_table_has_its_page_and_the_index_lists_it(tables: ModuleType) -> 
         assert "## Where it differs, and why\n\n" in text
         if name.startswith("table-"):
             assert "| published |" in text or "(published)" in text
+
+
+def test_the_page_of_held_out_scenes_says_what_its_writer_says(tables: ModuleType) -> None:
+    from held_out import figures, page  # noqa: PLC0415  (found where the fixture put the benchmarks' folder)
+
+    text = (PAGES / "held-out.md").read_text()
+    assert text.startswith(page.WORDS)
+    assert text.endswith(page.page([]).removeprefix(page.WORDS).lstrip())
+    for name in {*page.STRIPES.values(), *page.PIXELS.values()}:
+        assert f"*{name.removesuffix(' (mm)')}*" in page.WORDS, name
+    for method in {line.split(" | ")[2] for line in text.splitlines() if re.match(r"\| di|\| ro", line)}:
+        assert f"- *{method}*: " in page.WORDS
+    refused = figures.Found(refused="DecodeError: " + 30 * "seventeen ")
+    (row,) = (line for line in page.page([("roll", "blob", "mcp", refused)]).splitlines() if line.startswith("| roll"))
+    assert row.split(" | ")[3] == " ".join(8 * ["seventeen"] + ["..."])
 
 
 def test_a_table_that_is_not_there_is_wrong_usage(
