@@ -41,6 +41,9 @@ LEAST_CORRELATION = 0.25
 
 LEAST_STRETCHES = 16
 
+FEW_IN_ORDER = 0.7
+"""Share of neighbouring stripes in order that sound scans have, rods and steps before diagonal rigs included"""
+
 LEAST_PRESENT = 0.5
 """Share of the expected carriers that must be there at all: nine in ten are, on strong texture too"""
 
@@ -118,22 +121,25 @@ def require_carriers(
     projector: ProjectorSize,
     frame: NDArray[np.uint8] | NDArray[np.uint16],
     values: NDArray[np.float32],
+    in_order: float = 1.0,
 ) -> tuple[CarrierFit | None, str | None]:
     """Check one decoded scan.
 
     Args:
         frame: (H, W) the pattern's frame.
         values: (H, W) float32 decoded rows (axis "y") or columns ("x"), px, NaN where there is none.
+        in_order: share of neighbouring stripes that follow one another, as the decoder reports it.
 
     Returns:
-        What was found (None: too few stretches to say), and a warning if a noticeable part contradicts.
+        What was found (None: too few stretches to say), and a warning if a noticeable part contradicts, or if nothing
+        can be said and few of the stripes are in order.
 
     Raises:
         DecodeError: most of it does.
     """
     fit = fit_carriers(calibration, pattern, projector, frame, values)
     if fit is None:
-        return None, None
+        return None, _unchecked(in_order) if np.isfinite(values).any() else None
     if fit.contradicting > MOST_CONTRADICTING:
         raise DecodeError(
             f"{_said(fit)}: the pattern description or the calibration contradicts the frame",
@@ -160,6 +166,15 @@ def require_carriers(
             "the calibration is not this rig's any more, or not good to a tenth of a per cent"
         )
     return fit, None
+
+
+def _unchecked(in_order: float) -> str | None:
+    if in_order >= FEW_IN_ORDER:
+        return None
+    return (
+        f"of neighbouring stripes only {in_order:.0%} are in order, and too few run on for their carriers to be "
+        "checked: the values may be of something else than the pattern"
+    )
 
 
 def _said(fit: CarrierFit) -> str:

@@ -50,6 +50,16 @@ def test_right_descriptions_pass_in_silence(scene, seed):
         assert fit.contradicting < 0.1
 
 
+@pytest.mark.parametrize(("in_order", "shown", "warned"), [(0.5, 8, True), (0.5, 0, False), (0.95, 8, False)])
+def test_what_cannot_be_checked_is_said_where_few_stripes_are_in_order(in_order, shown, warned):
+    values = np.full((240, 320), np.nan, np.float32)
+    values[:, :shown] = np.arange(240, dtype=np.float32)[:, None]
+    fit, warning = require_carriers(CALIBRATION, PATTERN, QUICK, np.zeros((240, 320), np.uint8), values, in_order)
+    assert fit is None
+    assert (warning is not None) == warned
+    assert not warned or "only 50% are in order" in warning
+
+
 def test_the_first_stripe_taken_for_the_other_kind_is_refused():
     with pytest.raises(DecodeError, match="every stripe is 1 further on") as caught:
         checked("board", replace(PATTERN, first="unmodulated"))

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from scanner.decode.mcp import carriers, decision, description, emissions, hmm, linking, stripes, tracks
+from scanner.decode.mcp.decoder import decode_image
 from scanner.decode.mcp.model import PatternModel
-from scanner.patterns import McpPattern, ProjectorSize
+from scanner.errors import DecodeError
+from scanner.patterns import CameraFormat, McpPattern, ProjectorSize
 
 PROJECTOR = ProjectorSize(1152, 864)
+CAMERA = CameraFormat(696, 520)
 OWN = PatternModel.of(McpPattern(), PROJECTOR)
 PUBLISHED = PatternModel.of(
     McpPattern(carriers=(90.0, 106.0, 120.0, 132.0), codes=tuple(range(16)), levels="composite"), PROJECTOR
@@ -85,3 +90,49 @@ def test_a_peak_whose_carriers_were_hardly_measured_needs_more_to_be_decided():
     seen = emissions.Amplitudes(np.zeros((4, 4), np.float32), sigma, np.ones(4, np.float32))
     for model in (OWN, PUBLISHED):  # the weakest carrier is a quarter of its stripe's light in both
         np.testing.assert_allclose(decision.confidence_needed(seen, model), [0.9, 0.9, 0.99, 0.99], rtol=1e-6)
+
+
+def grid(across: float, along: float, degrees: float) -> np.ndarray:
+    """Two waves at right angles, turned; no pattern."""
+    angle = np.radians(degrees)
+    y, x = np.mgrid[: CAMERA.height, : CAMERA.width].astype(np.float64)
+    one = 0.5 + 0.5 * np.cos(2 * np.pi * (x * np.sin(angle) + y * np.cos(angle)) / across)
+    other = 0.7 + 0.3 * np.cos(2 * np.pi * (x * np.cos(angle) - y * np.sin(angle)) / along)
+    noise = np.random.default_rng(0).normal(0, 2, x.shape)
+    return np.clip(200 * one * other + 20 + noise, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("across", "along", "degrees"), [(15.5, 10, 32), (15, 10, 32), (15, 10, 30)])
+def test_a_grid_whose_stripes_show_words_by_chance_is_refused(across: float, along: float, degrees: float) -> None:
+    with pytest.raises(DecodeError):
+        decode_image(grid(across, along, degrees), McpPattern(), PROJECTOR, CAMERA)
+
+
+def test_names_without_any_value_are_said_to_be_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(description, "LEAST_ORDER", 0.0)
+    found = decode_image(grid(15.5, 10, 32), McpPattern(), PROJECTOR, CAMERA)
+    assert found.rows is not None
+    assert found.peaks is not None
+    assert not np.isfinite(found.rows).any()
+    assert len(found.peaks) > 100
+    assert "none has the next stripe beside it: no values" in found.warnings[0]
+
+
+def test_the_order_of_neighbours_is_asked_where_there_are_any() -> None:
+    sound = description.Agreement(clear=0.4, agree=0.99, order=0.95, hits=0.95, wraps=0.0)
+    assert sound.holds
+    assert replace(sound, order=0.7).holds  # rods before a rolled projector
+    assert not replace(sound, order=0.25).holds
+    found = [agreement_of(path) for path in ([3, 4, 5, 9, 10], [3, 9, 1, 14, 7])]
+    assert [round(each.order, 2) for each in found] == [0.75, 0.0]
+    assert agreement_of([3]).order == 1.0
+
+
+def agreement_of(path: list[int]) -> description.Agreement:
+    """Of one column of peaks a pitch apart."""
+    count, channels = len(path), OWN.channels
+    none = np.zeros((count, channels), np.float32)
+    seen = emissions.Amplitudes(none, none, np.zeros(count, np.float32))
+    evidence = np.zeros((count, OWN.stripes), np.float32)
+    columns = np.array([0, count], np.int32), np.zeros(count, np.int32)
+    return description.agreement(seen, evidence, OWN, np.ones(channels, np.float32), np.array(path, np.int32), columns)

@@ -30,6 +30,11 @@ LEAST_RUN = 4
 LEAST_PEAKS = 8
 """Peaks at a stripe's place that have to say the same before its word is doubted."""
 
+LEAST_ORDER = 0.45
+"""Share of neighbouring stripes that follow one another in an image of the pattern: half way between rods, steps and
+blocks before rolled and diagonal rigs, which leave .70 of them in order and more, and grids of two waves, whose stripes
+show words by chance, of which .25 and less follow."""
+
 MOST_ASKED = 2000
 """Peaks that are asked: enough for a share."""
 
@@ -40,10 +45,10 @@ class Agreement:
 
     clear: share of the peaks whose own carriers name a code word clearly (other than "all off", which unmodulated
     stripes show too). agree: share of these that the columns' model took for a stripe of that word. order: share of
-    neighbouring stripes in a column that follow one another. wraps: how often, in a whole pattern's height, one of its
-    last stripes is followed by one of its first without a gap, which no surface does but a code order that was rotated
-    (about once) or exchanged carriers do. hits: share of switched-on carriers seen with more than half their amplitude.
-    exchanged: code words that stand in one another's places.
+    neighbouring stripes in a column that follow one another, 1 where no stripe has a neighbour. wraps: how often, in a
+    whole pattern's height, one of its last stripes is followed by one of its first without a gap, which no surface does
+    but a code order that was rotated (about once) or exchanged carriers do. hits: share of switched-on carriers seen
+    with more than half their amplitude. exchanged: code words that stand in one another's places.
     """
 
     clear: float
@@ -61,9 +66,10 @@ class Agreement:
         another code order agree was .77 or less; with other carriers, fewer or more bits, fringes or an upside-down
         image few clear words were left and hits were .78 or less. The limits stand between. Without clear words there
         is no telling: a wrong magnification fits them all. Steps of depth jump back by a few stripes, never by half of
-        them along a third of the image.
+        them along a third of the image. Words alone do not make a pattern: where something else waves along its lines,
+        each shows one, and only their order says that nobody projected them.
         """
-        right = self.clear >= 0.02 and self.agree >= 0.85 and self.hits >= 0.7
+        right = self.clear >= 0.02 and self.agree >= 0.85 and self.hits >= 0.7 and self.order >= LEAST_ORDER
         return right and self.wraps < 0.3 and not self.exchanged
 
 
@@ -97,8 +103,9 @@ def agreement(
     own = model.ratio[np.maximum(path, 0)] * (path >= 0)[:, None]
     over = seen.ratio > 0.5 * modulation * own
     wraps = np.roll(path, 1) - path > model.stripes // 2
-    parts = (clear, agrees[clear], follows[pair], over[own > 0], wraps[pair] * model.stripes)
-    clear_share, agree, order, hits, wrapped = (float(part.mean()) if part.size else 0.0 for part in parts)
+    parts = (clear, agrees[clear], over[own > 0], wraps[pair] * model.stripes)
+    clear_share, agree, hits, wrapped = (float(part.mean()) if part.size else 0.0 for part in parts)
+    order = float(follows[pair].mean()) if pair.any() else 1.0
     exchanged = exchanged_words(each, places_in_order(path, first, gap)[thin], of_word, model)
     return Agreement(clear_share, agree, order, hits, wrapped, exchanged)
 

@@ -47,6 +47,11 @@ def maps_of(image: Image, found: Found, decided: Decision, model: PatternModel, 
     warnings = []
     if not len(peak_table):
         warnings.append("no stripe could be decided: carriers are there, but too weak or too short")
+    elif not np.isfinite(maps.rows).any():
+        warnings.append(
+            f"{len(peak_table)} peaks have a stripe's name, but none has the next stripe beside it: no values, and the "
+            "names are not to be trusted"
+        )
     figures = {
         **decided.figures,
         "peaks_kept": int((label >= 0).sum()),
