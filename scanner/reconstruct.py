@@ -31,7 +31,7 @@ from scanner.errors import DecodeError, ScannerError
 from scanner.geometry import Calibration, load_calibration
 from scanner.patterns import FrameRole, GrayPattern, GrayPmpPattern, McpPattern, PatternSequence, PmpPattern
 from scanner.ripple_correction import widen_by_ripple, without_ripple
-from scanner.saturation import saturation_warnings
+from scanner.saturation import overexposed
 from scanner.scale_check import require_codes_within, require_geometry
 from scanner.scan import Map, Scan, build_scan
 from scanner.scan_report import report_of_capture
@@ -241,8 +241,9 @@ class Reconstruction:
         """Maps and points."""
         tell("decoding")
         decoded = self._decoded()
-        bright = saturation_warnings(decoded.reason, capture)
-        decoded = replace(decoded, warnings=(*decoded.warnings, *capture.warnings, *bright))
+        decoded = replace(
+            decoded, warnings=(*decoded.warnings, *capture.warnings, *overexposed(decoded.reason, capture))
+        )
         require_codes_within(decoded, self._header.sequence)
         if len(self._header.sequence) > 1:
             # The witnesses have seen light: without it the check ends in an error of its own.
@@ -307,9 +308,8 @@ class Reconstruction:
         if position is None:
             return decoded
         with self._timed("check carriers"):
-            in_order = decoded.details.get("agreement", {}).get("order", 1.0)
             fit, warning = require_carriers(
-                self._calibration, sequence.pattern, sequence.projector, capture.frame(position), values, in_order
+                self._calibration, sequence.pattern, sequence.projector, capture.frame(position), values
             )
         details = {**decoded.details, "carrier_check": None if fit is None else fit.as_dict()}
         said = () if warning is None else (warning,)

@@ -34,7 +34,7 @@ PERCENTILE = 99.5
 _EVERY = 8
 
 
-def saturation_warnings(reason: NDArray[np.uint8], capture: Capture) -> tuple[str, ...]:
+def overexposed(reason: NDArray[np.uint8], capture: Capture) -> tuple[str, ...]:
     """What to say where more than `LARGE` of the pixels that show the pattern are saturated; () where not.
 
     Args:
