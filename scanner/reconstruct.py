@@ -308,8 +308,10 @@ class Reconstruction:
         if position is None:
             return decoded
         with self._timed("check carriers"):
+            said_by = decoded.details.get("agreement")
+            in_order = said_by["order"] if isinstance(said_by, dict) else 1.0  # Casey's decoder says one number
             fit, warning = require_carriers(
-                self._calibration, sequence.pattern, sequence.projector, capture.frame(position), values
+                self._calibration, sequence.pattern, sequence.projector, capture.frame(position), values, in_order
             )
         details = {**decoded.details, "carrier_check": None if fit is None else fit.as_dict()}
         said = () if warning is None else (warning,)
