@@ -80,7 +80,7 @@ def _expected(detail: ErrorDetails) -> str:
         return f"takes a list of {detail['ctx']['min_length']} or more"
     if detail["type"] == "too_long":
         return f"takes a list of {detail['ctx']['max_length']} at most"
-    said = detail["msg"]
+    said = detail["msg"].partition(", unable to parse")[0]
     for theirs, ours in _WORDS:
         said = said.replace(theirs, ours)
     return said

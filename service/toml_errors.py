@@ -161,7 +161,7 @@ def _likely_value_and_more(text: str, here: str) -> str:
     quoted = value.startswith(('"', "'"))
     cases = (
         (here.startswith((";", "//")), _ONLY_COMMENTS),
-        (thousands, f"nothing stands between thousands: {key} = {value.replace(',', '')}; or several: [{value}]"),
+        (thousands, f"nothing stands between thousands, and a fraction has a point: {key} = {value.replace(',', '')}"),
         (numbers, f"several numbers stand in brackets: {key} = [{value}]{fraction}"),
         (re.match(r"0\d", value), f"a number has no zeros before it: {value.lstrip('0') or '0'}"),
         (re.fullmatch(r"\d+\.", value), f"a number ends with a digit: {value}0"),

@@ -21,8 +21,8 @@ def check_config(
 ) -> int:
     """Check a rig file: keys, values, drivers and their options, scenes, modes, calibration. Opens no device.
 
-    All problems are named at once; where the syntax of several lines is broken, what they should say comes after it is
-    mended. What only a device can say, fringed doctor FILE finds.
+    All problems are named at once, but those of keys that are missing, or on a line that is no TOML: they are named
+    once the syntax is right. What only a device can say, fringed doctor FILE finds.
 
     \b
     Examples:

@@ -127,6 +127,7 @@ def test_simulated_devices_of_two_worlds_are_odd(tmp_path: Path) -> None:
         ('["CAM1", "CAM9"]', "option outputs: takes 'CAM1', 'CAM2', 'SYNC' or 'LED', got 'CAM9'"),
         ("[]", "option outputs: takes a list of 1 or more"),
         ('"CAM1"', "option outputs: takes a list, got 'CAM1'"),
+        ('["LED"], timeout_ms = "x"', "option timeout_ms: takes a valid integer, got 'x'"),
     ],
 )
 def test_a_list_that_does_not_fit_is_told_in_the_files_own_words(tmp_path: Path, outputs: str, said: str) -> None:

@@ -26,7 +26,11 @@ from service.toml_errors import syntax_problems
         ("gain_db = 5.", (1, 12), "a number ends with a digit: 5.0"),
         ("gain_db = 007", (1, 12), "no zeros before it: 7"),
         ("gain_db = 1,5", (1, 12), "gain_db = [1,5]; a fraction has a point: 1.5"),
-        ("exposure_us = 20,000", (1, 17), "exposure_us = 20000; or several: [20,000]"),
+        (
+            "exposure_us = 20,000",
+            (1, 17),
+            "nothing stands between thousands, and a fraction has a point: exposure_us = 20000",
+        ),
         ("latency_us = 3000, 5000", (1, 18), "latency_us = [3000, 5000]"),
         ("latency_us = 4 ms", (1, 16), "without its unit, which is in the key's name: latency_us = 4"),
         ("region = (0, 0, 2, 2)", (1, 10), "square brackets"),
