@@ -8,11 +8,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scanner.capture import Capture
 from scanner.capture.exposure import exposure_report
-from scanner.decode import Reason
+from scanner.decode import Decoded, Reason
 from scanner.decode.reasons import tally
 from scanner.patterns import PmpPattern
 
@@ -34,14 +33,14 @@ PERCENTILE = 99.5
 _EVERY = 8
 
 
-def overexposed(reason: NDArray[np.uint8], capture: Capture) -> tuple[str, ...]:
+def overexposed(decoded: Decoded, capture: Capture) -> tuple[str, ...]:
     """What to say where more than `LARGE` of the pixels that show the pattern are saturated; () where not.
 
     Args:
-        reason: (H, W), why each pixel has no value.
+        decoded: the maps; `reason` tells what is saturated.
         capture: whose frames these are; it may still be open.
     """
-    counts = tally(reason)
+    counts = tally(decoded.reason)
     shows = int(counts.sum() - counts[Reason.SHADOW] - counts[Reason.LOW_MODULATION])
     clipped = int(counts[Reason.CLIPPED])
     if clipped <= LARGE * shows:

@@ -34,17 +34,17 @@ def capture(brightness: float, pattern: Pattern = PMP, exposure: dict[str, Any] 
     return SimpleNamespace(header=header, records=dict.fromkeys(range(len(sequence))), frame=frame)
 
 
-def reasons(clipped: float) -> Any:
+def decoded(clipped: float) -> Any:
     """A quarter of the pixels is in shadow; of the others a share is clipped."""
     found = np.zeros(1000, np.uint8)
     found[:250] = Reason.SHADOW
     found[250 : 250 + round(750 * clipped)] = Reason.CLIPPED
-    return found.reshape(25, 40)
+    return SimpleNamespace(reason=found.reshape(25, 40))
 
 
 @pytest.mark.parametrize("brightness", [1.1, 1.5, 3.0, 6.0])
 def test_the_exposure_that_is_advised_saturates_nothing_and_is_no_dim_one(brightness: float) -> None:
-    (warning,) = overexposed(reasons(0.5), capture(brightness))
+    (warning,) = overexposed(decoded(0.5), capture(brightness))
     assert "overexposed: 50.0% of the pixels in which the pattern shows" in warning
     assert "--exposure auto" in warning
     advised = re.search(r"expose for ([0-9.]+) ms at most \(these were 40\)", warning)
@@ -54,15 +54,15 @@ def test_the_exposure_that_is_advised_saturates_nothing_and_is_no_dim_one(bright
 
 @pytest.mark.parametrize("clipped", [0.0, 0.009])
 def test_glints_are_no_warning(clipped: float) -> None:
-    assert overexposed(reasons(clipped), capture(3.0)) == ()
+    assert overexposed(decoded(clipped), capture(3.0)) == ()
 
 
 def test_frames_that_are_no_sinusoids_tell_no_brightness() -> None:
-    (warning,) = overexposed(reasons(0.2), capture(3.0, GrayPattern()))
+    (warning,) = overexposed(decoded(0.2), capture(3.0, GrayPattern()))
     assert "expose for half of these 40 ms at most" in warning
 
 
 def test_what_was_exposed_automatically_is_not_told_to_be() -> None:
-    (warning,) = overexposed(reasons(0.2), capture(1.1, exposure={"mode": "auto"}))
+    (warning,) = overexposed(decoded(0.2), capture(1.1, exposure={"mode": "auto"}))
     assert "ms at most" in warning
     assert "auto" not in warning
