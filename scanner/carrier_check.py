@@ -10,7 +10,9 @@ Nothing here needs the phase itself, so a calibration may be off by pixels.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -166,6 +168,12 @@ def require_carriers(
             "the calibration is not this rig's any more, or not good to a tenth of a per cent"
         )
     return fit, None
+
+
+def in_order_of(details: Mapping[str, Any]) -> float:
+    """Share of neighbouring stripes in order, of a decoder's details; 1 where it does not say (Casey's says none)."""
+    agreement = details.get("agreement")
+    return float(agreement["order"]) if isinstance(agreement, Mapping) else 1.0
 
 
 def _unchecked(in_order: float) -> str | None:

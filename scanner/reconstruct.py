@@ -18,7 +18,7 @@ import numpy as np
 from scanner.calibration.watch import watched
 from scanner.capture import Capture, CaptureHeader
 from scanner.capture.exposure import exposure_warnings
-from scanner.carrier_check import require_carriers
+from scanner.carrier_check import in_order_of, require_carriers
 from scanner.compare import compare
 from scanner.contrast import widen_at_edges
 from scanner.decode import Decoded, Decoder, KeepingDecoder, decoder_for
@@ -306,10 +306,9 @@ class Reconstruction:
         if position is None:
             return decoded
         with self._timed("check carriers"):
-            said_by = decoded.details.get("agreement")
-            in_order = said_by["order"] if isinstance(said_by, dict) else 1.0  # Casey's decoder says one number
+            frame, in_order = capture.frame(position), in_order_of(decoded.details)
             fit, warning = require_carriers(
-                self._calibration, sequence.pattern, sequence.projector, capture.frame(position), values, in_order
+                self._calibration, sequence.pattern, sequence.projector, frame, values, in_order
             )
         details = {**decoded.details, "carrier_check": None if fit is None else fit.as_dict()}
         said = () if warning is None else (warning,)

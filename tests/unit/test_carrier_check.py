@@ -10,7 +10,7 @@ import pytest
 
 from drivers.simulated.rigs import rig
 from scanner import carrier_check
-from scanner.carrier_check import CarrierFit, fit_carriers, require_carriers
+from scanner.carrier_check import CarrierFit, fit_carriers, in_order_of, require_carriers
 from scanner.decode import decoder_for
 from scanner.errors import DecodeError
 from scanner.patterns import McpPattern, PatternSequence
@@ -58,6 +58,8 @@ def test_what_cannot_be_checked_is_said_where_few_stripes_are_in_order(in_order,
     assert fit is None
     assert (warning is not None) == warned
     assert not warned or "only 50% are in order" in warning
+    assert in_order_of({"agreement": {"order": in_order}}) == in_order
+    assert in_order_of({"agreement": 0.9}) == 1.0
 
 
 def test_the_first_stripe_taken_for_the_other_kind_is_refused():

@@ -1,5 +1,7 @@
 """MCP frames of too few pixels: the refusal names that cause, and does not where the pixels are enough."""
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import pytest
@@ -71,3 +73,32 @@ def test_fine_stripes_are_measured_in_noise_and_coarse_ones_left_alone(model: Pa
     assert resolution.fine_stripes(noise, model) is None
     high = np.interp(at / 6, np.arange(len(model.column)), model.column).astype(np.float32)
     assert resolution.fine_stripes(high + noise, model) is None
+
+
+def stripes_down(_: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return 120 + 100 * np.cos(2 * np.pi * x / 15)
+
+
+def lettering(y: np.ndarray, _: np.ndarray) -> np.ndarray:
+    page = np.full(y.shape, 230, np.uint8)
+    for row in range(20, len(page), 22):
+        cv2.putText(page, "The quick brown fox jumps over the lazy dog" * 2, (5, row), 0, 0.5, 20)
+    return page
+
+
+def squares(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return 30 + 180 * ((x // 23 + y // 23) % 2)
+
+
+def grain(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    noise = np.fft.rfft2(np.random.default_rng(1).normal(size=y.shape))
+    distance = np.hypot(np.fft.fftfreq(y.shape[0])[:, None], np.fft.rfftfreq(y.shape[1])[None])
+    seen = np.fft.irfft2(noise / np.maximum(distance, 1e-3) ** 1.5, y.shape)
+    return 128 + 50 * seen / seen.std()
+
+
+@pytest.mark.parametrize("picture", [stripes_down, lettering, squares, grain])
+def test_pictures_without_the_pattern_are_not_too_fine(picture: Callable[..., np.ndarray]) -> None:
+    y, x = np.mgrid[:520, :696]
+    noise = np.random.default_rng(3).normal(0, 2, y.shape)
+    assert "too fine" not in str(refusal((picture(y, x) + noise).clip(0, 255).astype(np.uint8)))

@@ -188,12 +188,12 @@ def _search(
     found: Found, image: Image, model: PatternModel, camera: CameraFormat, clock: Stages, aspect: float = 1.0
 ) -> Found:
     """Stripes and carriers at one candidate's pitch, the projector's pixels `aspect` times as wide as high."""
+    if found.match < MIN_PITCH_MATCH:
+        found.fault = f"no stripes of this pattern (spectra agree to {found.match:.2f})"
+        return found
     if found.pitch < stripes.MIN_PITCH_PX:
         found.fault = f"stripes are {found.pitch:.1f} px apart, too fine for this camera"
         found.hint = "project fewer bits, or move the camera closer"
-        return found
-    if found.match < MIN_PITCH_MATCH:
-        found.fault = f"no stripes of this pattern (spectra agree to {found.match:.2f})"
         return found
     around = aspect * found.pitch / model.pitch
     with clock.stage("peaks"):

@@ -2,6 +2,7 @@
 
 Stripes of two to four pixels are noise to the search for stripes; carriers of less than two pixels make codes that
 contradict the description. Asked only where a frame is refused: a surface seen at a slant may look finer than it is.
+Pictures without the pattern have fine lines, too: text, tiles, a photograph's grain. It must be the strongest of all.
 """
 
 from __future__ import annotations
@@ -24,9 +25,17 @@ FINE_PX = 2 * stripes.MIN_PITCH_PX
 flanks of two pixels and more."""
 
 STANDS_OUT = 2.0
-"""Ratio to the median of a spectrum's fine part above which a line is no noise. A mean of 64 columns' amplitudes,
-which are Rayleigh distributed, scatters by .07 of it: the largest of some hundred stays below 1.3, of eight columns'
-below 1.8."""
+"""Ratio to the median of a spectrum's fine part, and of what lies about it, above which a line is neither noise nor the
+slope of a picture. A mean of 64 columns' amplitudes, which are Rayleigh distributed, scatters by .07 of it: the largest
+of some hundred stays below 1.3, of eight columns' below 1.8."""
+
+NEAR, ABOUT = 1.2, 1.7
+"""What lies about a line: further off than the first factor, which keystone and tilt take, and within the second"""
+
+MOST_BELOW = 2.3
+"""Coarser lines' amplitude over the line's own, up to which it is not theirs. Stripes bright and dim in turn have 1.6
+times as much at two of them, and scenes before the published pattern no more; harmonics of text and of squares have
+four times as much below them, photographs three and more."""
 
 LEAST_CONTRAST = 0.01
 """Share of the camera's range below which an image shows nothing (as in `locate`)."""
@@ -83,12 +92,19 @@ def fine_stripes(reduced: Array, model: PatternModel) -> float | None:
         model: the pattern's tables.
     """
     amplitude, frequency, best = _strongest_line(reduced[:: max(1, len(reduced) // 64)])
-    fine = frequency > 1 / FINE_PX
+    fine, line = frequency > 1 / FINE_PX, frequency[best]
     if not fine[best] or amplitude[best] < STANDS_OUT * float(np.median(amplitude[fine])):
+        return None
+    away = np.abs(np.log(np.maximum(frequency, 1e-9) / line))
+    about = (away > np.log(NEAR)) & (away < np.log(ABOUT))
+    coarser = (frequency * reduced.shape[1] >= stripes.MIN_STRIPES) & (frequency < line / NEAR)
+    if about.any() and amplitude[best] < STANDS_OUT * float(np.median(amplitude[about])):
+        return None
+    if coarser.any() and amplitude[best] * MOST_BELOW < float(amplitude[coarser].max()):
         return None
     # Stripes that are bright and dim in turn have their strongest line at two of them.
     _, own, of_pattern = _strongest_line(np.tile(model.column, 4)[None, :])
-    return float(16 * own[of_pattern] / frequency[best])
+    return float(16 * own[of_pattern] / line)
 
 
 def _strongest_line(columns: Array) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
