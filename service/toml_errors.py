@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import re
+import sys
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ WIDEST = 96
 
 _PLACE = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 _KEY = re.compile(r"""(?<= )\(["'].*\)(?= twice$|$)""")
+_HUGE = re.compile(rf"\d(?:_?\d){{{sys.int_info.default_max_str_digits}}}")
 _SPANNING = ("Unclosed array", "Unterminated string", 'Expected "', "Cannot declare")
 _HEADER = re.compile(r"\s*\[?\[?\s*([\w-]+(?:\.[\w-]+)*)\s*\]?\]?\s*(?:#.*)?")
 _TABLE = re.compile(r"\s*\[\s*[\w-]+(?:\.[\w-]+)*\s*\]\s*(?:#.*)?")
@@ -70,9 +72,27 @@ def syntax_problems(text: str) -> tuple[list[SyntaxProblem], str | None]:
             if problem.said.startswith(_SPANNING) or not lines[problem.line - 1]:
                 return found, None
             lines[problem.line - 1] = _mended(problem)
+        except ValueError:  # int()'s own: the parser lets it through
+            at, huge = _huge(lines)
+            if huge is None:
+                raise
+            found.append(
+                SyntaxProblem(
+                    at + 1, huge.start() + 1, "Integer of too many digits", "too large for any key", lines[at]
+                )
+            )
+            lines[at] = ""
         else:
             return found, "\n".join(lines)
     return found, None
+
+
+def _huge(lines: Sequence[str]) -> tuple[int, re.Match[str] | None]:
+    """Index of the first line with an integer that Python refuses to read, and where in it that is."""
+    for at, line in enumerate(lines):
+        if huge := _HUGE.search(line.partition("#")[0]):
+            return at, huge
+    return -1, None
 
 
 def _mended(problem: SyntaxProblem) -> str:

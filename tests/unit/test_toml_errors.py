@@ -123,3 +123,16 @@ def test_a_rig_file_names_errors_of_syntax_and_of_content_together(tmp_path: Pat
         'projector.driver = "nobody"',
         "projector.dwell = 0",
     ]
+
+
+def test_an_integer_that_python_refuses_to_read_is_an_error_of_its_line(tmp_path: Path) -> None:
+    text = f"[camera]\ndwell = {'9' * 5000}\n# {'1' * 5000}\n[x]\ny = {'1_0' * 3000}\n"
+    found, rest = syntax_problems(text)
+    assert [(one.line, one.column, one.said) for one in found] == [
+        (2, 9, "Integer of too many digits"),
+        (5, 5, "Integer of too many digits"),
+    ]
+    assert rest is not None
+    assert tomllib.loads(rest) == {"camera": {}, "x": {}}
+    (tmp_path / "rig.toml").write_text(text)
+    assert any("too many digits" in one.expected for one in read_rig(tmp_path / "rig.toml").problems)
