@@ -74,6 +74,12 @@ class _Called(Request, frozen=True, kw_only=True):
     jsonrpc: Literal["2.0"]
 
 
+class _Identified(Struct, frozen=True):
+    """A call of which nothing but the id is read."""
+
+    id: int | str | None = None
+
+
 class ErrorBody(Struct, frozen=True):
     """An error: code, message for people, and data {class, device, hint, ...} for programs."""
 
@@ -223,6 +229,7 @@ _Params = TypeVar("_Params", bound=Struct)
 
 _encoder = msgspec.msgpack.Encoder()
 _requests = msgspec.msgpack.Decoder(_Called)
+_identified = msgspec.msgpack.Decoder(_Identified)
 _responses = msgspec.msgpack.Decoder(Response)
 _notifications = msgspec.msgpack.Decoder(Notification)
 
@@ -280,13 +287,13 @@ def decode_request(data: bytes) -> Request:
 
 
 def request_id(data: bytes) -> int | str | None:
-    """The id of a request that could not be read whole, if at least that can be."""
-    try:
-        content = msgspec.msgpack.decode(data[:MAX_REQUEST_BYTES])
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+    """The id of a request that could not be read whole, if at least that can be. No other member is made an object."""
+    if len(data) > MAX_REQUEST_BYTES:
         return None
-    found = content.get("id") if isinstance(content, dict) else None
-    return found if isinstance(found, int | str) and not isinstance(found, bool) else None
+    try:
+        return _identified.decode(data).id
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return None
 
 
 def decoded(decoder: msgspec.msgpack.Decoder[_T], data: bytes | memoryview, what: str) -> _T:

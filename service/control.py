@@ -116,27 +116,22 @@ class Control:
 
     async def answer_bytes(self, identity: bytes, body: list[bytes]) -> bytes:
         """The answer to a call as it came: its parts, of which there should be one. Always answers."""
-        number = request_id(body[0]) if len(body) == 1 else None
         try:
             request = decode_request(_only_part(body))
             result = await self.answer(identity, request)
             return result.data if isinstance(result, _Encoded) else encode(Response(id=request.id, result=result))
         except ScannerError as error:
-            return encode(Response(id=number, error=error_body(error)))
+            return _refusal(body, error)
         except Exception as error:  # noqa: BLE001  (one call that fails must not end the daemon)
             _log.exception("a call failed")
             problem = ScannerError(f"the daemon failed: {type(error).__name__}: {error}", hint="see its log")
-            return encode(Response(id=number, error=error_body(problem)))
+            return _refusal(body, problem)
 
     @staticmethod
     def refuse_bytes(body: list[bytes], waiting: int) -> bytes:
         """The answer to a call of somebody of whom `waiting` calls wait already."""
-        error = Refused(
-            f"{waiting} calls of this connection wait already",
-            reason="queue_full",
-            hint="read the answers before calling again",
-        )
-        return encode(Response(id=request_id(body[0]) if len(body) == 1 else None, error=error_body(error)))
+        said = f"{waiting} calls of this connection wait already"
+        return _refusal(body, Refused(said, reason="queue_full", hint="read the answers before calling again"))
 
     async def answer(self, identity: bytes, request: Request) -> Any:
         """A call's result.
@@ -348,6 +343,10 @@ class Control:
 
     def _with_number(self, job: Job) -> dict[str, Any]:
         return {"number": self._last_event(), **job.status()}
+
+
+def _refusal(body: list[bytes], error: ScannerError) -> bytes:
+    return encode(Response(id=request_id(body[0]) if len(body) == 1 else None, error=error_body(error)))
 
 
 def _only_part(body: list[bytes]) -> bytes:

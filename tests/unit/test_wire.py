@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -107,6 +108,16 @@ def test_the_id_of_a_broken_request_is_found_if_it_can_be() -> None:
     assert wire.request_id(msgpack.packb({"id": "a"})) == "a"
     assert wire.request_id(msgpack.packb({"id": True})) is None
     assert wire.request_id(b"\xc1") is None
+    assert wire.request_id(msgpack.packb({"id": 5, "more": bytes(wire.MAX_REQUEST_BYTES)})) is None
+
+
+def test_finding_the_id_makes_nothing_of_the_other_members() -> None:
+    lists = b"\x82\xa6params\xdd" + (900_000).to_bytes(4, "big") + b"\x90" * 900_000 + b"\xa2id\x07"
+    tracemalloc.start()
+    assert wire.request_id(lists) == 7
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100_000  # the lists would take 50 MB, and half a second of everybody's
 
 
 def test_members_of_envelopes_that_are_not_known_are_ignored() -> None:
