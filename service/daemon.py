@@ -36,6 +36,7 @@ from scanner.wire import (
 )
 from service.callers import ANSWERS_HELD, Callers
 from service.control import Control, Endpoints
+from service.descriptors import Admission, raise_limit
 from service.devices_link import SILENCE_S as DEVICES_SILENCE_S
 from service.devices_link import DevicesLink
 from service.jobs import JobStore
@@ -132,7 +133,11 @@ class Daemon:
             self._config.rig, self._endpoints, pipeline, devices, workers, live, lambda: self._number, self.stop
         )
         callers = Callers(self._control, control.answer_bytes, control.refuse_bytes)
-        serving = [asyncio.create_task(callers.serve()), asyncio.create_task(self._drain_subscriptions())]
+        listening = (self._endpoints.control, self._endpoints.events, self._endpoints.worker)
+        admission = Admission(dict(zip(listening, (self._control, self._events, router), strict=True)))
+        serving = [
+            asyncio.create_task(work) for work in (callers.serve(), self._drain_subscriptions(), admission.watch())
+        ]
         workers.start(self._config.daemon.workers)
         opening = asyncio.create_task(_open_early(devices))
         loading = asyncio.create_task(asyncio.to_thread(import_module, "service.door"))  # before the first scan waits
@@ -233,6 +238,7 @@ def run_daemon(
     Raises:
         ConfigError, StorageError, ProtocolError: it cannot begin.
     """
+    raise_limit()
     tell = _say_ready if lifeline else ready
     asyncio.run(_run(config, state_dir, endpoint or config.daemon.endpoint, lifeline, tell))
 

@@ -43,6 +43,7 @@ from scanner.stream import (
     decode_to_worker,
 )
 from scanner.wire import MAX_MESSAGE_BYTES, PROTOCOL
+from service.descriptors import raise_limit
 from service.logs import start_logging
 from service.work import Work
 
@@ -210,6 +211,7 @@ def run_worker(endpoint: str, *, decode: bool = True, ready: Callable[[], None] 
     Raises:
         Unreachable: no daemon there.
     """
+    raise_limit()  # it publishes live results; the daemon's own workers have its limit
     with Client(endpoint, name="worker") as client:
         address = client.hello()["endpoints"]["worker"]
     Worker(address, decode=decode).run(ready)
