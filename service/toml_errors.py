@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import re
-import sys
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,8 @@ WIDEST = 96
 
 _PLACE = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 _KEY = re.compile(r"""(?<= )\(["'].*\)(?= twice$|$)""")
-_HUGE = re.compile(rf"\d(?:_?\d){{{sys.int_info.default_max_str_digits}}}")
+_HUGE = re.compile(r"(?<![\w.])(?:0[xob][\da-fA-F](?:_?[\da-fA-F]){64,}|\d(?:_?\d){300,})(?![\w.])")
+_QUOTED = re.compile(r"""\"[^"]*\"|'[^']*'""")
 _SPANNING = ("Unclosed array", "Unterminated string", 'Expected "', "Cannot declare")
 _HEADER = re.compile(r"\s*\[?\[?\s*([\w-]+(?:\.[\w-]+)*)\s*\]?\]?\s*(?:#.*)?")
 _TABLE = re.compile(r"\s*\[\s*[\w-]+(?:\.[\w-]+)*\s*\]\s*(?:#.*)?")
@@ -73,26 +73,24 @@ def syntax_problems(text: str) -> tuple[list[SyntaxProblem], str | None]:
                 return found, None
             lines[problem.line - 1] = _mended(problem)
         except ValueError:  # int()'s own: the parser lets it through
-            at, huge = _huge(lines)
-            if huge is None:
+            if not _left_out_huge(lines, found):
                 raise
-            found.append(
-                SyntaxProblem(
-                    at + 1, huge.start() + 1, "Integer of too many digits", "too large for any key", lines[at]
-                )
-            )
-            lines[at] = ""
         else:
-            return found, "\n".join(lines)
+            if not _left_out_huge(lines, found):
+                return found, "\n".join(lines)
     return found, None
 
 
-def _huge(lines: Sequence[str]) -> tuple[int, re.Match[str] | None]:
-    """Index of the first line with an integer that Python refuses to read, and where in it that is."""
+def _left_out_huge(lines: list[str], found: list[SyntaxProblem]) -> bool:
+    """Leave out the first line with an integer that is too long to be shown or made a float; False where none is."""
     for at, line in enumerate(lines):
-        if huge := _HUGE.search(line.partition("#")[0]):
-            return at, huge
-    return -1, None
+        bare = _QUOTED.sub(lambda quoted: " " * len(quoted[0]), line).partition("#")[0]
+        if huge := _HUGE.search(bare):
+            said, likely = "Integer of too many digits", "too large for any key"
+            found.append(SyntaxProblem(at + 1, huge.start() + 1, said, likely, line))
+            lines[at] = ""
+            return True
+    return False
 
 
 def _mended(problem: SyntaxProblem) -> str:

@@ -134,5 +134,8 @@ def test_an_integer_that_python_refuses_to_read_is_an_error_of_its_line(tmp_path
     ]
     assert rest is not None
     assert tomllib.loads(rest) == {"camera": {}, "x": {}}
+    for harmless in (f"x = 0.{'1' * 400}", f"x = {'1' * 400}.0", f"x = '{'1' * 5000}'", f"x = 1 # {'1' * 5000}"):
+        assert syntax_problems(harmless) == ([], harmless)
+    text = f"[camera]\nexposure_us = 0x{'f' * 5000}\n"  # int() reads it, and str() and float() do not
     (tmp_path / "rig.toml").write_text(text)
     assert any("too many digits" in one.expected for one in read_rig(tmp_path / "rig.toml").problems)
