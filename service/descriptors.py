@@ -23,8 +23,9 @@ MOST_WANTED = 65_536
 """Descriptors asked for: libraries that close all there might be take seconds where the limit is a thousand million"""
 
 MOST_USED = 8192
-"""Descriptors in use at which nobody may connect any more, or half of what there may be, where that is fewer: between
-two looks libzmq accepts a thousand connections on each socket at most, as then its queue of events is full."""
+"""Descriptors in use at which nobody may connect any more, or a quarter of what there may be, where that is fewer. Each
+socket's queue of events holds two thousand, and libzmq waits when it is full: from a limit of 16,384 on no haste of
+clients reaches it before this process has looked; below, one would have to keep it from looking for some time."""
 
 REOPEN_S = 0.25
 """Pause between looks whether enough are free again"""
@@ -79,7 +80,7 @@ class Admission:
 
     def _decide(self) -> None:
         limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-        most = MOST_USED if limit == resource.RLIM_INFINITY else min(limit // 2, MOST_USED)
+        most = MOST_USED if limit == resource.RLIM_INFINITY else min(limit // 4, MOST_USED)
         used = open_descriptors()
         if self._open and used >= most:
             _log.warning("%d file descriptors in use, of %d: nobody may connect until they are fewer", used, limit)
