@@ -108,9 +108,26 @@ def test_a_grid_whose_stripes_show_words_by_chance_is_refused(across: float, alo
         decode_image(grid(across, along, degrees), McpPattern(), PROJECTOR, CAMERA)
 
 
+@pytest.mark.parametrize("waves", [1, 4])
+def test_one_wave_along_short_chains_is_no_set_of_carriers(waves: int) -> None:
+    random = np.random.default_rng(3)
+    count, length = 40, 14
+    x = np.arange(stripes.STEP * length)
+    on = OWN.carriers[:waves] / 1.4
+    phase = random.uniform(0, 2 * np.pi, (count, 1, waves))
+    light = 1 + 0.2 * np.cos(2 * np.pi * x[None, :, None] * on + phase).sum(axis=2)
+    light += random.normal(0, 0.01, light.shape)
+    places = np.arange(count * length, dtype=np.int32)
+    start = np.arange(0, count * length + 1, length, dtype=np.int32)
+    chains = linking.Chains(places, start, places % length)
+    scales = 1.4 * np.exp(np.arange(-0.7, 0.701, 0.02))
+    found = carriers._by_least_squares(light.astype(np.float32).ravel(), chains, OWN, scales, 1.4, 128)
+    assert (found.contrast[0] > 3) == (waves == 4)
+
+
 def test_names_without_any_value_are_said_to_be_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(description, "LEAST_ORDER", 0.0)
-    found = decode_image(grid(15.5, 10, 32), McpPattern(), PROJECTOR, CAMERA)
+    found = decode_image(grid(15, 10, 32), McpPattern(), PROJECTOR, CAMERA)
     assert found.rows is not None
     assert found.peaks is not None
     assert not np.isfinite(found.rows).any()

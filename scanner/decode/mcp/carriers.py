@@ -302,9 +302,35 @@ def _by_least_squares(
     Carriers that lie nearer than a chain resolves are no lines in its spectrum, but of the right set of frequencies all
     chains are made up. Where any set fits (fewer samples than three for each unknown) nothing is said.
     """
-    unknowns = 3 + 2 * model.channels
+    sets = model.carriers[None, :] / scales[:, None]
+    left = _left_by(light, chains, sets, size)
+    if not left.any():
+        return CarrierSearch(around, 0.0, 0.0, (0.0,) * model.channels)
+    # Between like remainders the magnification nearest to what the pitch says.
+    best = int(np.argmin(left / np.median(left) + 0.5 * np.log(scales / around) ** 2))
+    # One wave that is all there is lies on one carrier of many a set: what it leaves alone, the set must better.
+    step = LOG_STEP * SHORT_STEP
+    single = np.exp(np.arange(np.log(sets.min()), np.log(sets.max()) + step, step))
+    alone = _left_by(light, chains, single[:, None], size, model.channels)
+    contrast = min(float(np.median(left)), float(alone.min())) / float(left[best])
+    return CarrierSearch(float(scales[best]), 0.0, 0.0, (contrast,) * model.channels)
+
+
+def _left_by(
+    light: Array, chains: Chains, sets: NDArray[np.float64], size: int, channels: int | None = None
+) -> NDArray[np.float64]:
+    """Energy that ground and waves leave of all pieces, for each set of waves.
+
+    Args:
+        light: along the tracks.
+        chains: the chains.
+        sets: (Q, N) cycles per px.
+        size: most samples of a piece.
+        channels: pieces are as long as so many waves ask for; by default N.
+    """
+    unknowns = 3 + 2 * (sets.shape[1] if channels is None else channels)
     lengths = np.minimum(chains.lengths * STEP, size)
-    left = np.zeros(len(scales))
+    left = np.zeros(len(sets))
     for length in np.unique(lengths[lengths >= 3 * unknowns]):
         begin = STEP * chains.start[:-1][lengths == length]
         pieces = light[begin[:, None] + np.arange(length)].astype(np.float64)
@@ -313,18 +339,14 @@ def _by_least_squares(
         ground = np.linalg.qr(np.vander(2 * t / length, 3) * window[:, None])[0]
         pieces *= window / np.maximum(np.abs(pieces.mean(axis=1, keepdims=True)), 1e-6)
         pieces -= (pieces @ ground) @ ground.T
-        for i, scale in enumerate(scales):
-            phase = 2 * np.pi * t[:, None] * (model.carriers / scale)
+        for i, waves_per_px in enumerate(sets):
+            phase = 2 * np.pi * t[:, None] * waves_per_px
             waves = np.concatenate([np.cos(phase), np.sin(phase)], axis=1) * window[:, None]
             waves -= ground @ (ground.T @ waves)
             axes, strength, _ = np.linalg.svd(waves, full_matrices=False)
             fitted = pieces @ axes[:, strength > 0.1 * strength[0]]
             left[i] += float((pieces**2).sum() - (fitted**2).sum())
-    if not left.any():
-        return CarrierSearch(around, 0.0, 0.0, (0.0,) * model.channels)
-    # Between like remainders the magnification nearest to what the pitch says.
-    best = int(np.argmin(left / np.median(left) + 0.5 * np.log(scales / around) ** 2))
-    return CarrierSearch(float(scales[best]), 0.0, 0.0, (float(np.median(left) / left[best]),) * model.channels)
+    return left
 
 
 def _spectra(light: Array, chains: Chains, size: int) -> tuple[NDArray[np.float64], Ints]:

@@ -24,9 +24,9 @@ from scanner.errors import DecodeError
 from scanner.geometry import Calibration
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
 
-LEAST_DECIDED = 0.3
-"""Share of the peaks of a pattern that is turned that have a name: .7 and more in sound scenes, .13 and less where
-coins and dim scenes make stripes of the other way"""
+LEAST_DECIDED = 0.55
+"""Share of the peaks of a pattern that is turned that have a name: nearly .7 and more in sound scenes, .46 and less
+where coins, dim and glossy scenes make stripes of the other way"""
 
 
 def decode_image(
