@@ -60,7 +60,7 @@ def test_a_rig_is_calibrated_by_itself(rig: Path, tmp_path: Path, capsys: pytest
     assert first.header.extra["warm_up"]["devices_open_s"] == opened[0]
     for words_said in (
         "taken from the rig file",
-        "response: light follows",
+        "response: gamma",
         "pose 3: 54 points; residual 0.0",
         "next:",
     ):
