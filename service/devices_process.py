@@ -208,6 +208,8 @@ class DevicesProcess:
 
     def _set_preview(self, command: Preview) -> None:
         opened = self._devices.opened
+        if self._previewer is not None and opened is not None and self._previewer.is_of(command, opened.rig):
+            return  # a client asks again where pictures are late: they would be later still, and the socket gone
         if self._previewer is not None:
             self._end_preview()
             if opened is not None:

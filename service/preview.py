@@ -50,6 +50,7 @@ class Previewer:
         self._exposure_ns = round(1000 * exposure_us) if isinstance(exposure_us, int | float) else None
         self._rig = rig
         self._clock = clock
+        self._wanted = wanted
         self._period_ns = round(1e9 / wanted.rate_hz)
         self._max_width = wanted.max_width
         self._numbers = itertools.count(1)
@@ -72,7 +73,10 @@ class Previewer:
             self._socket.bind(wanted.endpoint)
         finally:
             os.umask(before)
-        self._endpoint = wanted.endpoint
+
+    def is_of(self, wanted: Preview, rig: Rig) -> bool:
+        """Whether this is the preview that is wanted; of devices that were opened anew it is none."""
+        return self._wanted == wanted and self._rig is rig
 
     def pause_s(self) -> float:
         """Time until the next picture is due."""
@@ -160,7 +164,7 @@ class Previewer:
         """End the preview."""
         self.rest()
         self._context.destroy(linger=0)
-        remove_sockets([self._endpoint])
+        remove_sockets([self._wanted.endpoint])
 
     def _begin(self) -> None:
         if self._running:

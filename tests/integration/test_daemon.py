@@ -324,11 +324,15 @@ def test_preview_shows_what_the_camera_sees(client: Client) -> None:
         preview.setsockopt(zmq.LINGER, 0)
         preview.setsockopt(zmq.CONFLATE, 1)
         preview.setsockopt(zmq.SUBSCRIBE, b"")
-        preview.connect(client.preview_start(rate_hz=20.0, max_width=160))
+        words: dict[str, Any] = {"rate_hz": 20.0, "max_width": 160}
+        preview.connect(client.preview_start(**words))
         assert preview.poll(20_000)
         header, pixels = decode_preview(preview.recv())
         assert (header.width, header.height, header.stride) == (160, 120, 2)
         assert np.frombuffer(pixels, np.uint8).max() > 50
+        client.preview_start(**words)  # as clients do where pictures are late: it must not begin anew
+        numbers = [header.number, *(decode_preview(preview.recv())[0].number for _ in range(3))]
+        assert numbers == sorted(set(numbers))
         assert client.scan("mcp").xyz is not None  # a scan goes before, and the preview goes on after it
         preview.recv()
         assert preview.poll(20_000)

@@ -62,9 +62,11 @@ def test_a_rig_files_exposure_is_kept(tmp_path: Path) -> None:
 def test_without_anybody_who_looks_the_light_goes_out_until_there_is_somebody(tmp_path: Path) -> None:
     bench = Bench("quick/board")
     endpoint = f"ipc://{tmp_path}/preview.ipc"
-    previewer = Previewer(
-        Rig(projector=bench.projector, camera=bench.camera), bench.clock, Preview(endpoint, 10.0, 400), 9e3
-    )
+    rig, wanted = Rig(projector=bench.projector, camera=bench.camera), Preview(endpoint, 10.0, 400)
+    previewer = Previewer(rig, bench.clock, wanted, 9e3)
+    assert previewer.is_of(Preview(endpoint, 10.0, 400), rig)
+    assert not previewer.is_of(Preview(endpoint, 20.0, 400), rig)
+    assert not previewer.is_of(wanted, Rig(projector=bench.projector, camera=bench.camera)), "opened anew"
     loaded: list[int] = []
     load = bench.projector.load
     with pytest.MonkeyPatch.context() as patch, zmq.Context() as context:
