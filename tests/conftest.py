@@ -38,7 +38,7 @@ LONG_LIVED_KINDS = ("GarbageCollectorThread",)
 """pyzmq's, which frees what was sent without a copy; it ends with the process"""
 
 KERNEL_THREAD = 0x0020_0000
-"""PF_KTHREAD among the flags of /proc/PID/stat (proc(5)): it has neither command line nor environment"""
+"""PF_KTHREAD among the flags of /proc/PID/stat (proc(5)): it has no environment to read, and is nobody's"""
 
 CHANCES = 3
 
@@ -141,6 +141,9 @@ def _processes() -> Iterator[str]:
         try:
             # The name in brackets may hold blanks; state, parent and flags follow the last bracket.
             fields = (folder / "stat").read_text().rpartition(")")[2].split()
+            if int(fields[6]) & KERNEL_THREAD:
+                _strangers.add(name)
+                continue
             environment = (folder / "environ").read_bytes()
             command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
         except PermissionError:
@@ -148,8 +151,8 @@ def _processes() -> Iterator[str]:
             continue
         except (OSError, ValueError):
             continue  # it ended while we looked
-        state, parent, of_kernel = fields[0], fields[1], int(fields[6]) & KERNEL_THREAD
-        if not environment and not command and not of_kernel and state not in "ZX":
+        state, parent = fields[0], fields[1]
+        if not environment and not command and state not in "ZX":
             yield f"{name} (in the middle of its start)"  # whose it is shows at the next look
         elif MARK.encode() not in environment.split(b"\0") and parent != me:
             _strangers.add(name)
