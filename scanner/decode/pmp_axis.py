@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scanner.decode import Decoded, Map, Reason
 from scanner.decode.addresses import maps_to_fill
 from scanner.decode.agreement import MIN_PIXELS, Remainder
+from scanner.decode.cut_at_black import unmove_dark
 from scanner.decode.neighbours import settle
 from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel
 from scanner.decode.pmp_frames import AxisFrames
@@ -235,6 +236,10 @@ def decode_axis(
         settled = settle(maps.position, maps.sigma, maps.confidence, maps.reason, camera.width, per_px)
         counts[Reason.UNWRAP_RISK] -= settled
         counts[Reason.VALUE] += settled
+    if counts[Reason.MOVED]:
+        dark = unmove_dark(maps.reason, frames, least, t.min_modulation_sigmas, camera.max_value)
+        counts[Reason.MOVED] -= dark
+        counts[Reason.SHADOW] += dark
     if counts[Reason.MOVED] >= PARTS * LEAST_LIT * LEAST_SHARE:
         shape = camera.shape
         confidence, torn = maps.confidence.reshape(shape), maps.reason.reshape(shape)

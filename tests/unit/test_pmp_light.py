@@ -246,3 +246,20 @@ def test_rows_whose_frames_contradict_one_another_from_side_to_side_are_out_of_s
     np.testing.assert_array_equal(found.reason == Reason.VALUE, np.isfinite(found.rows))
     assert found.details["counts"]["out_of_step"] == band.size
     assert sum(found.details["counts"].values()) == found.reason.size
+
+
+def test_what_lies_in_the_dark_contradicts_nothing():
+    """Noise cut off at black looks small on the whole: what is left of it at a few pixels is no scene that moves."""
+    pattern, random = PmpPattern(("y",), (1.0, 8.0, 24.0), (3, 3, 4)), np.random.default_rng(7)
+    frames = shown(pattern)
+    for frame in frames:
+        faint = 0.008 * frame + random.normal(0, 0.8, frame.shape)
+        faint[:, :200] -= 1
+        dark = np.rint(np.clip(faint, 0, 255)).astype(np.uint8)
+        frame[:, :100], frame[:, 140:] = dark[:, :100], dark[:, 140:]
+    found = decoded(pattern, frames)
+    dark = np.delete(found.reason, np.s_[100:140], axis=1)
+    assert np.all((dark == Reason.SHADOW) | (dark == Reason.LOW_MODULATION))
+    assert np.all(found.reason[5:-5, 100:140] == Reason.VALUE)
+    assert found.details["counts"]["shadow"] == np.count_nonzero(found.reason == Reason.SHADOW)
+    assert "moved" not in found.details["counts"]
