@@ -1,7 +1,7 @@
 # Everyday commands of this clone. Each brings the set-up up to date first; `make help` lists them.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV
+unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV PYTHONDONTWRITEBYTECODE
 export PYTHONNOUSERSITE := 1
 
 bin := .venv/bin
@@ -20,9 +20,9 @@ scan: setup ## scan the simulated rig; ARGS="--method mcp" and the like are pass
 
 test: setup ## all tests; ARGS="-k config" and the like are passed on
 	@setup/firmware-tools.sh
-	@# Units share the processors; those that start processes and watch the clock go one by one. 5: none was asked for.
-	@for part in "-n auto --maxprocesses 4 --dist loadfile tests/unit" "--ignore tests/unit tests"; do \
-	    $(bin)/python -m pytest -q $$part $(ARGS) || [ $$? -eq 5 ] || exit 1; done
+	@# Tests share the processors, long files first; those that watch the clock go one by one. 5: none was asked for.
+	@run() { $(bin)/python -m pytest -q "$$@" $(ARGS) || [ $$? -eq 5 ]; }; \
+	    run -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m "not alone" && run -m alone
 	@setup/rig.sh told
 
 rig: ## drivers against the kernel's virtual devices, the service under systemd: in a guest under QEMU

@@ -15,6 +15,7 @@ from scanner.clock import MonotonicClock
 from tests.contract.suite import CameraBench, CameraContract
 
 pytest.importorskip("gi", reason="cameras behind Aravis need python3-gi (setup/packages.txt)")
+pytestmark = pytest.mark.alone
 
 ADDRESS = "127.0.0.11"
 CAMERAS = (

@@ -41,6 +41,7 @@ class TestSimulatedTriggerBoard(TriggerContract):
         projector.close()
 
 
+@pytest.mark.alone
 class TestSerialTriggerBoardOnSimulatedOne(TriggerContract):
     @pytest.fixture
     def bench(self) -> Iterator[TriggerBench]:
@@ -51,6 +52,7 @@ class TestSerialTriggerBoardOnSimulatedOne(TriggerContract):
             board.close()
 
 
+@pytest.mark.alone
 @pytest.mark.real_time
 class TestSerialTriggerBoardOnTheFirmware(TriggerContract):
     @pytest.fixture

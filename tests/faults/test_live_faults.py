@@ -16,6 +16,8 @@ from scanner.live import LiveFrame
 from scanner.series import read_series
 from tests.faults.daemons import RunningDaemon, children, wait_for
 
+pytestmark = pytest.mark.alone
+
 RIG = "simulated:quick/board?ring=6&period_us=16667&modulation=none"
 SHORT = {"exposure": 15_000.0}
 

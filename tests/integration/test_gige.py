@@ -22,6 +22,7 @@ from scanner.devices import CameraFrame, CameraSettings, Source, TriggerMode
 from scanner.errors import ConfigError, DeviceBusy, DeviceError, DeviceLost, DeviceNotFound
 
 pytest.importorskip("gi", reason="cameras behind Aravis need python3-gi (setup/packages.txt)")
+pytestmark = pytest.mark.alone
 
 SECOND_NS = 1_000_000_000
 ADDRESS = "127.0.0.21"

@@ -15,6 +15,8 @@ import pytest
 
 from drivers.simulated.gige_serve import GigeService
 
+pytestmark = pytest.mark.alone
+
 viva = pytest.importorskip(
     "viva_genicam", reason="the second GigE Vision client is not installed: pip install viva-genicam"
 )

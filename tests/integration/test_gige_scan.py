@@ -29,6 +29,7 @@ from scanner.sequencer.plan import Mode
 from tests.unit.sequencer_bench import QUICK, MemorySink, Taken, pmp, take
 
 pytest.importorskip("gi", reason="cameras behind Aravis need python3-gi (setup/packages.txt)")
+pytestmark = pytest.mark.alone
 
 ADDRESS = "127.0.0.41"
 EXPOSURE_NS = 12_500_000

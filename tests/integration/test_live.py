@@ -29,6 +29,8 @@ from service.cli import main
 from service.config import load_rig
 from service.private import private_daemon
 
+pytestmark = pytest.mark.alone
+
 RIG = "simulated:quick/board?ring=6&period_us=16667&modulation=none"
 SHORT = {"exposure": 15_000.0}
 """Shorter than the period: sixty frames a second."""

@@ -29,6 +29,8 @@ from scanner.errors import (
     PermissionDenied,
 )
 
+pytestmark = pytest.mark.alone
+
 CLOCK = MonotonicClock()
 VSYNC_US = 4_000
 
