@@ -23,6 +23,7 @@ import zmq.asyncio
 
 from scanner.client_asyncio import AsyncClient
 from scanner.client_sockets import WELCOME_S, configured, conflated, loaded, probe, send, single
+from scanner.endpoints import DEFAULT_ENDPOINT
 from scanner.errors import ScannerError, Unreachable
 from scanner.session import (
     QUIET_S,
@@ -39,7 +40,7 @@ from scanner.session import (
     start_call,
     unreachable,
 )
-from scanner.wire import DEFAULT_ENDPOINT, WELCOME, Event
+from scanner.wire import WELCOME, Event
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -15,6 +15,7 @@ import zmq
 import zmq.asyncio
 
 from scanner.client_sockets import WELCOME_S, configured, conflated, loaded, probe, send, single
+from scanner.endpoints import DEFAULT_ENDPOINT
 from scanner.errors import ProtocolError, ScannerError
 from scanner.session import (
     QUIET_S,
@@ -31,7 +32,7 @@ from scanner.session import (
     start_call,
     unreachable,
 )
-from scanner.wire import DEFAULT_ENDPOINT, Event
+from scanner.wire import Event
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from scanner.endpoints import ipc_path
 from scanner.errors import ProtocolError, ScannerError, StorageError, Unreachable
 from scanner.storage import storage_errors, sync_folder
 from scanner.wire import (
@@ -33,7 +34,6 @@ from scanner.wire import (
     decoded,
     encode_request,
     error_from_body,
-    ipc_path,
 )
 
 RESEND_S = 2.0

@@ -7,6 +7,7 @@ docs/reference/protocol.md; its bytes are made from these types.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
@@ -17,19 +18,24 @@ from scanner.errors import ProtocolError, ScannerError, from_data
 PROTOCOL = (1, 0)
 """Major and minor version: another major is refused, another minor is not."""
 
-DEFAULT_ENDPOINT = "ipc:///run/fringed/control.ipc"
+MAX_REQUEST_BYTES = 1 << 14
+"""Larger requests are answered with an error. The longest that makes sense is a third of it: 341 frequencies with their
+shifts, and a table of 256 grey levels."""
 
-MAX_REQUEST_BYTES = 1 << 20
-"""Larger requests are answered with an error."""
+MAX_SENT_BYTES = 2 << 20
+"""Larger messages to the daemon are not received at all: ZeroMQ drops the connection (ZMQ_MAXMSGSIZE)."""
 
 MAX_FETCH_BYTES = 4 << 20
 """Most bytes of a file in one answer."""
 
 MAX_MESSAGE_BYTES = 8 << 20
-"""Larger messages are not received at all: ZeroMQ drops the connection (ZMQ_MAXMSGSIZE)."""
+"""No message of the daemon or a worker is larger; nor does the other of the two receive more."""
 
 MAX_LIVE_BYTES = 64 << 20
 """The same for live results: 5 megapixels of XYZ."""
+
+MAX_MESSAGE_TEXT = 4000
+"""Characters of an error's message"""
 
 MAX_STRIDE = 64
 """Live XYZ is thinned by this at most."""
@@ -68,10 +74,13 @@ class Request(Struct, frozen=True, kw_only=True):
     params: dict[str, Any] = {}
 
 
-class _Called(Request, frozen=True, kw_only=True):
-    """A call as it came: here "jsonrpc" has to be said."""
+class _Called(Struct, frozen=True, kw_only=True):
+    """A call as it came: "jsonrpc" has to be said, and the parameters are not made objects yet."""
 
     jsonrpc: Literal["2.0"]
+    id: int | str
+    method: str
+    params: msgspec.Raw = msgspec.Raw(b"\x80")
 
 
 class _Identified(Struct, frozen=True):
@@ -229,6 +238,7 @@ _Params = TypeVar("_Params", bound=Struct)
 
 _encoder = msgspec.msgpack.Encoder()
 _requests = msgspec.msgpack.Decoder(_Called)
+_maps = msgspec.msgpack.Decoder(dict[str, Any])
 _identified = msgspec.msgpack.Decoder(_Identified)
 _responses = msgspec.msgpack.Decoder(Response)
 _notifications = msgspec.msgpack.Decoder(Notification)
@@ -261,21 +271,25 @@ def encode_request(request: Request) -> bytes:
     return data
 
 
-def decode_request(data: bytes) -> Request:
-    """Read a call.
+def too_long(length: int) -> Refused:
+    """What is said to a request of so many bytes."""
+    said = f"a request of {length} bytes, {MAX_REQUEST_BYTES} are taken"
+    return Refused(said, reason="too_large", hint="see hello's limits")
+
+
+def decode_request(data: bytes, check: Callable[[str], None] | None = None) -> Request:
+    """Read a call; `check` is given its method, and where it raises the parameters are not read at all.
 
     Raises:
         Refused: too long, not MessagePack, or not a JSON-RPC 2.0 request.
     """
     if len(data) > MAX_REQUEST_BYTES:
-        raise Refused(
-            f"a request of {len(data)} bytes, {MAX_REQUEST_BYTES} are taken",
-            reason="too_large",
-            hint="see hello's limits",
-        )
+        raise too_long(len(data))
     try:
         called = _requests.decode(data)
-        return Request(id=called.id, method=called.method, params=called.params)
+        if check is not None:
+            check(called.method)
+        return Request(id=called.id, method=called.method, params=_maps.decode(called.params))
     except msgspec.ValidationError as error:
         raise Refused(
             f"not a JSON-RPC 2.0 request: {error}",
@@ -287,7 +301,7 @@ def decode_request(data: bytes) -> Request:
 
 
 def request_id(data: bytes) -> int | str | None:
-    """The id of a request that could not be read whole, if at least that can be. No other member is made an object."""
+    """The id of a request that is not read whole, if it can be. No other member is made an object."""
     if len(data) > MAX_REQUEST_BYTES:
         return None
     try:
@@ -353,9 +367,13 @@ def params_as(kind: type[_Params], request: Request) -> _Params:
 
 
 def error_body(error: ScannerError) -> ErrorBody:
-    """An error as it crosses the wire."""
+    """An error as it crosses the wire; one that quotes what it refuses, not all of that."""
     reason = getattr(error, "reason", None)
-    return ErrorBody(JSONRPC_CODES.get(str(reason), error.code), error.message, error.data())
+    return ErrorBody(JSONRPC_CODES.get(str(reason), error.code), _shortened(error.message), error.data())
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= MAX_MESSAGE_TEXT else f"{text[: MAX_MESSAGE_TEXT - 4]} ..."
 
 
 def error_from_body(body: ErrorBody) -> ScannerError:
@@ -364,32 +382,3 @@ def error_from_body(body: ErrorBody) -> ScannerError:
     if body.data.get("class") == ProtocolError.__name__ and isinstance(reason, str):
         return Refused(body.message, reason=reason, hint=body.data.get("hint"))
     return from_data(body.message, body.data)
-
-
-# --- endpoints ----------------------------------------------------------------------------------------------------
-
-
-def ipc_path(endpoint: str) -> str:
-    """The socket file of a local endpoint.
-
-    Raises:
-        Refused: not ipc, or longer than the system's socket names.
-    """
-    if not endpoint.startswith("ipc://"):
-        raise Refused(
-            f"endpoint {endpoint!r} is not local: only ipc:// is served",
-            reason="endpoint",
-            hint="connections from other machines need CURVE keys, which this version does not have; "
-            "use ipc:// here, or forward the socket through ssh",
-        )
-    path = endpoint.removeprefix("ipc://")
-    if not path.startswith("/") or len(path.encode()) > 100:  # sockaddr_un holds 107, siblings add a few
-        raise Refused(f"endpoint {endpoint!r} needs an absolute path of at most 100 bytes", reason="endpoint")
-    return path
-
-
-def sibling(endpoint: str, name: str) -> str:
-    """The endpoint of another socket of the same daemon: events, preview, live or worker."""
-    folder, _, file = ipc_path(endpoint).rpartition("/")
-    stem = file.removesuffix(".ipc")
-    return f"ipc://{folder}/{name if stem == 'control' else f'{stem}-{name}'}.ipc"

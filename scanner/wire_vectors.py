@@ -94,7 +94,7 @@ CALLS: tuple[tuple[str, dict[str, Any], Any], ...] = (
             "daemon": {"name": "bench", "version": "0.1.0", "pid": 4711},
             "features": ["hello", "status", "scan.start"],
             "limits": {
-                "request_bytes": 1048576,
+                "request_bytes": 16384,
                 "message_bytes": 8388608,
                 "fetch_bytes": 4194304,
                 "queued_scans": 256,

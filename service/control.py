@@ -6,15 +6,12 @@ import asyncio
 import logging
 import os
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, cast
+from typing import TYPE_CHECKING, Any
 
-from scanner.errors import DeviceBusy, ScannerError, StorageError
-from scanner.storage import temporary_of
+from scanner.errors import DeviceBusy, StorageError
 from scanner.wire import (
     LARGE_BYTES,
     MAX_FETCH_BYTES,
@@ -30,18 +27,13 @@ from scanner.wire import (
     PreviewStart,
     Refused,
     Request,
-    Response,
     ScanStart,
-    answer_head,
-    decode_request,
-    encode,
-    error_body,
     params_as,
-    request_id,
 )
 from service.devices_link import DevicesLink
 from service.jobs import Job, JobState
 from service.live import Live
+from service.pieces import Encoded, large_piece, piece
 from service.pipe import Preview
 from service.pipeline import MAX_QUEUED, Pipeline
 from service.worker_pool import WorkerPool
@@ -114,24 +106,24 @@ class Control:
             "shutdown": self._shutdown,
         }
 
-    async def answer_bytes(self, identity: bytes, body: list[bytes]) -> bytes:
-        """The answer to a call as it came: its parts, of which there should be one. Always answers."""
-        try:
-            request = decode_request(_only_part(body))
-            result = await self.answer(identity, request)
-            return result.data if isinstance(result, _Encoded) else encode(Response(id=request.id, result=result))
-        except ScannerError as error:
-            return _refusal(body, error)
-        except Exception as error:  # noqa: BLE001  (one call that fails must not end the daemon)
-            _log.exception("a call failed")
-            problem = ScannerError(f"the daemon failed: {type(error).__name__}: {error}", hint="see its log")
-            return _refusal(body, problem)
+    def check(self, identity: bytes, method: str) -> None:
+        """Whether a method is served, to this connection.
 
-    @staticmethod
-    def refuse_bytes(body: list[bytes], waiting: int) -> bytes:
-        """The answer to a call of somebody of whom `waiting` calls wait already."""
-        said = f"{waiting} calls of this connection wait already"
-        return _refusal(body, Refused(said, reason="queue_full", hint="read the answers before calling again"))
+        Raises:
+            Refused: no; nothing else of its call needs to be read.
+        """
+        if method != "hello" and method not in self._methods:
+            raise Refused(
+                f"unknown method {method[:100]!r}",
+                reason="unknown_method",
+                hint=f"methods: hello, {', '.join(self._methods)}",
+            )
+        if method != "hello" and identity not in self._clients:
+            raise Refused(
+                f"{method} before hello: this connection is not known",
+                reason="hello_required",
+                hint="say hello first, and again when the daemon was restarted",
+            )
 
     async def answer(self, identity: bytes, request: Request) -> Any:
         """A call's result.
@@ -139,23 +131,10 @@ class Control:
         Raises:
             ScannerError: what the client is told.
         """
+        self.check(identity, request.method)
         if request.method == "hello":
             return self._hello(identity, request)
-        method = self._methods.get(request.method)
-        if method is None:
-            raise Refused(
-                f"unknown method {request.method!r}",
-                reason="unknown_method",
-                hint=f"methods: hello, {', '.join(self._methods)}",
-            )
-        client = self._clients.get(identity)
-        if client is None:
-            raise Refused(
-                f"{request.method} before hello: this connection is not known",
-                reason="hello_required",
-                hint="say hello first, and again when the daemon was restarted",
-            )
-        return await method(request, client)
+        return await self._methods[request.method](request, self._clients[identity])
 
     def _hello(self, identity: bytes, request: Request) -> dict[str, Any]:
         given = params_as(Hello, request)
@@ -225,6 +204,7 @@ class Control:
 
     async def _start(self, request: Request, client: str) -> dict[str, Any]:
         params = params_as(ScanStart, request)
+        self._refuse_endless(params)
         if self._pipeline.store.find(params, client) is None:
             self._refuse_nonsense(params)
             self._refuse_while_live()
@@ -244,7 +224,7 @@ class Control:
             self._pipeline.spool.lease(job.id)
         return job.result()
 
-    async def _fetch(self, request: Request, _client: str) -> bytes | _Encoded:
+    async def _fetch(self, request: Request, _client: str) -> bytes | Encoded:
         given = params_as(Fetch, request)
         job = self._pipeline.store.get(given.id)
         size = None if job.deleted else job.readable(given.name)
@@ -266,8 +246,8 @@ class Control:
         inside, _, name = given.name.rpartition("/")
         path = (folder / inside if inside else folder / (job.output or "")) / name
         if length < LARGE_BYTES:
-            return await asyncio.to_thread(_piece, path, given.offset, length)
-        return await asyncio.to_thread(_large_piece, request.id, path, given.offset, length)
+            return await asyncio.to_thread(piece, path, given.offset, length)
+        return await asyncio.to_thread(large_piece, request.id, path, given.offset, length)
 
     async def _cancel(self, request: Request, _client: str) -> dict[str, Any]:
         job = self._job(request)
@@ -293,6 +273,7 @@ class Control:
 
     async def _live_start(self, request: Request, client: str) -> dict[str, Any]:
         params = params_as(LiveStart, request)
+        self._refuse_endless(params)
         if self._pipeline.store.find(params, client) is None:
             self._refuse_nonsense(params)
         job = await self._live.start(params, client)
@@ -305,6 +286,12 @@ class Control:
     async def _live_status(self, request: Request, _client: str) -> dict[str, Any]:
         params_as(Nothing, request)
         return {"number": self._last_event(), "run": self._live.status()}
+
+    @staticmethod
+    def _refuse_endless(params: ScanStart | LiveStart) -> None:
+        from service.door import refuse_endless  # noqa: PLC0415  (as below)
+
+        refuse_endless(params)
 
     def _refuse_nonsense(self, params: ScanStart | LiveStart) -> None:
         from service.door import refuse_nonsense  # noqa: PLC0415  (brings NumPy; loaded while the devices open)
@@ -343,56 +330,3 @@ class Control:
 
     def _with_number(self, job: Job) -> dict[str, Any]:
         return {"number": self._last_event(), **job.status()}
-
-
-def _refusal(body: list[bytes], error: ScannerError) -> bytes:
-    return encode(Response(id=request_id(body[0]) if len(body) == 1 else None, error=error_body(error)))
-
-
-def _only_part(body: list[bytes]) -> bytes:
-    if len(body) != 1:
-        raise Refused(f"a call has one part, not {len(body)}", reason="invalid_request")
-    return body[0]
-
-
-@dataclass(frozen=True)
-class _Encoded:
-    """A result that stands in its answer's bytes already."""
-
-    data: bytes
-
-
-def _piece(path: Path, offset: int, length: int) -> bytes:
-    with _opened(path) as file:
-        return os.pread(file.fileno(), length, offset)
-
-
-def _large_piece(number: int | str | None, path: Path, offset: int, length: int) -> _Encoded | bytes:
-    """The answer, read into its own bytes; of a file that is shorter than it was the bytes that there are."""
-    head = answer_head(number, length)
-    answer = bytearray(len(head) + length)
-    answer[: len(head)] = head
-    with _opened(path) as file:
-        got = os.preadv(file.fileno(), [memoryview(answer)[len(head) :]], offset)
-    # A bytearray, of which a socket takes the bytes like those of any other.
-    return _Encoded(cast(bytes, answer)) if got == length else bytes(answer[len(head) : len(head) + got])
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
-    """A file, or its bytes so far where it is not whole yet; it may become that meanwhile."""
-    try:
-        for place in (path, temporary_of(path), path):
-            try:
-                file = place.open("rb", buffering=0)
-            except FileNotFoundError as error:
-                missing = error
-                continue
-            with file:
-                yield file
-            return
-        raise missing
-    except OSError as error:
-        raise StorageError(
-            f"{path.name} cannot be read: {error.strerror}", hint="was the spool changed by hand?"
-        ) from error

@@ -25,16 +25,13 @@ from typing import TYPE_CHECKING, Any
 import zmq
 import zmq.asyncio
 
+from scanner.endpoints import sibling
 from scanner.errors import ConfigError, ScannerError
 from scanner.storage import storage_errors
 from scanner.stream import SILENCE_S as WORKER_SILENCE_S
-from scanner.wire import (
-    Event,
-    Notification,
-    encode,
-    sibling,
-)
-from service.callers import ANSWERS_HELD, Callers
+from scanner.wire import MAX_REQUEST_BYTES, MAX_SENT_BYTES, Event, Notification, encode
+from service.callers import ANSWERS_HELD, CALLS_HELD, Callers
+from service.calls import Calls
 from service.control import Control, Endpoints
 from service.descriptors import Admission, raise_limit
 from service.devices_link import SILENCE_S as DEVICES_SILENCE_S
@@ -44,7 +41,15 @@ from service.live import Live
 from service.logs import start_logging
 from service.notify import Notifier
 from service.pipeline import Pipeline
-from service.sockets import bound, keep_from_clients, refuse_files, refuse_taken, remove_sockets, send_now
+from service.sockets import (
+    MAX_SUBSCRIPTION_BYTES,
+    bound,
+    keep_from_clients,
+    refuse_files,
+    refuse_taken,
+    remove_sockets,
+    send_now,
+)
 from service.spool import Limits, Spool
 from service.worker_pool import WorkerPool
 
@@ -119,8 +124,9 @@ class Daemon:
     async def _serve(
         self, context: zmq.asyncio.Context, store: JobStore, spool: Spool, lock: int, ready: asyncio.Event | None
     ) -> None:
-        self._control = bound(context, zmq.ROUTER, self._endpoints.control, high_water=ANSWERS_HELD)
-        self._events = bound(context, zmq.XPUB, self._endpoints.events)
+        held = {"high_water": ANSWERS_HELD, "received": CALLS_HELD, "longest": MAX_SENT_BYTES}
+        self._control = bound(context, zmq.ROUTER, self._endpoints.control, **held)
+        self._events = bound(context, zmq.XPUB, self._endpoints.events, longest=MAX_SUBSCRIPTION_BYTES)
         router = bound(context, zmq.ROUTER, self._endpoints.worker)
         keep_from_clients(self._endpoints.worker)
         rig = self._config.model_dump(mode="json")
@@ -132,7 +138,7 @@ class Daemon:
         control = Control(
             self._config.rig, self._endpoints, pipeline, devices, workers, live, lambda: self._number, self.stop
         )
-        callers = Callers(self._control, control.answer_bytes, control.refuse_bytes)
+        callers = Callers(self._control, Calls(control), MAX_REQUEST_BYTES)
         listening = (self._endpoints.control, self._endpoints.events, self._endpoints.worker)
         admission = Admission(dict(zip(listening, (self._control, self._events, router), strict=True)))
         serving = [

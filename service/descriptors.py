@@ -17,7 +17,7 @@ from typing import Any
 import zmq
 import zmq.asyncio
 
-from scanner.wire import ipc_path
+from scanner.endpoints import ipc_path
 
 MOST_WANTED = 65_536
 """Descriptors asked for: libraries that close all there might be take seconds where the limit is a thousand million"""

@@ -23,6 +23,10 @@ from service.scan_patterns import check_length, pattern_for
 MOST_EXPOSURE_US = 10_000_000
 """No camera here exposes longer (`service.config`)."""
 
+MOST_ENTRIES = 2048
+"""Numbers, lists and maps of a pattern in all: 1024 images are 341 frequencies with their shifts, a table has 256 grey
+levels. To look closely at more takes everybody's time."""
+
 _USUAL = ProjectorSize(1152, 864)
 """Stands for a projector that is not open yet: members are checked, whether they fit is not."""
 
@@ -57,6 +61,26 @@ def refuse_nonsense(
         require_decoder(params.method, params.decoder)
     except DecodeError as error:
         raise ConfigError(error.message, hint=error.hint) from error
+
+
+def refuse_endless(params: ScanStart | LiveStart) -> None:
+    """Raise where a pattern has more members than any: `plain` and `refuse_nonsense` look at each.
+
+    Raises:
+        ConfigError: it has.
+    """
+    entries = 0
+    within: list[Mapping[Any, Any] | list[Any]] = [params.pattern or {}]
+    while within:
+        held = within.pop()
+        entries += len(held)
+        if entries > MOST_ENTRIES:
+            raise ConfigError(
+                f"the pattern has more than {MOST_ENTRIES} numbers",
+                hint="no list of frequencies, shifts or codes is so long",
+            )
+        members = held.values() if isinstance(held, Mapping) else held
+        within.extend(member for member in members if isinstance(member, list | Mapping) and member)
 
 
 def plain(params: ScanStart | LiveStart) -> dict[str, Any]:

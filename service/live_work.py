@@ -23,9 +23,10 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from scanner.durations import Durations
+from scanner.endpoints import ipc_path
 from scanner.errors import DecodeError, ProtocolError, ScannerError
 from scanner.stream import FromWorker, LiveBegin, LiveCounts, LiveFrame
-from scanner.wire import MAX_MESSAGE_BYTES, ipc_path
+from scanner.wire import MAX_MESSAGE_BYTES
 from scanner.wire_images import LiveHeader, encode_image
 from service.sockets import remove_sockets
 

@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
 from pydantic_core import PydanticCustomError
 
+from scanner.endpoints import DEFAULT_ENDPOINT, ipc_path
 from scanner.errors import ScannerError
-from scanner.wire import DEFAULT_ENDPOINT, ipc_path
 from service.toml_text import to_toml
 
 SAID = "said"

@@ -15,12 +15,17 @@ from typing import cast
 import zmq
 import zmq.asyncio
 
+from scanner.endpoints import ipc_path
 from scanner.errors import ConfigError, StorageError
 from scanner.storage import storage_errors
-from scanner.wire import LARGE_BYTES, MAX_MESSAGE_BYTES, WELCOME, ipc_path
+from scanner.wire import LARGE_BYTES, MAX_MESSAGE_BYTES, WELCOME
 
 HIGH_WATER = 10_000
 """Messages that wait for one peer; more are refused (ROUTER) or dropped (events), never waited for."""
+
+
+MAX_SUBSCRIPTION_BYTES = 512
+"""What a subscriber sends: its greeting, and which messages it wants. ZeroMQ keeps 40 bytes for each of these bytes."""
 
 
 class Sent(Enum):
@@ -34,18 +39,26 @@ class Sent(Enum):
 
 
 def bound(
-    context: zmq.asyncio.Context, kind: int, endpoint: str, *, high_water: int = HIGH_WATER
+    context: zmq.asyncio.Context,
+    kind: int,
+    endpoint: str,
+    *,
+    high_water: int = HIGH_WATER,
+    received: int = HIGH_WATER,
+    longest: int = MAX_MESSAGE_BYTES,
 ) -> zmq.asyncio.Socket:
     """A socket bound to a local endpoint: folder 0750 if it is made here, socket 0660.
 
     Args:
         high_water: messages to one peer that wait in ZeroMQ.
+        received: the same of messages from one peer; beyond, ZeroMQ reads no more of it, and the peer has to wait.
+        longest: bytes of a message from a peer; ZeroMQ ends the connection of one that sends more.
 
     Raises:
         StorageError: the folder cannot be made or written.
     """
     opened = context.socket(kind)
-    options = [(zmq.LINGER, 0), (zmq.SNDHWM, high_water), (zmq.RCVHWM, HIGH_WATER), (zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)]
+    options = [(zmq.LINGER, 0), (zmq.SNDHWM, high_water), (zmq.RCVHWM, received), (zmq.MAXMSGSIZE, longest)]
     if kind == zmq.ROUTER:
         options.append((zmq.ROUTER_MANDATORY, 1))
     for option, value in options:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from scanner.wire import DEFAULT_ENDPOINT
+from scanner.endpoints import DEFAULT_ENDPOINT
 from service.commands.options import AsJson
 from service.terminal import print_facts, print_json, print_table
 

@@ -11,7 +11,7 @@ import pytest
 
 from scanner.errors import ConfigError
 from scanner.wire import LiveStart, Request, ScanStart, params_as
-from service.door import refuse_nonsense
+from service.door import refuse_endless, refuse_nonsense
 from service.jobs import parameters_digest
 
 ID = "0b3e3a52-9f0e-4c52-8a55-3f1d8f3b6a11"
@@ -58,6 +58,15 @@ def asked(kind: type[ScanStart | LiveStart] = ScanStart, **params: Any) -> Any:
 def test_nonsense_is_refused_by_name(params: dict[str, Any], named: str) -> None:
     with pytest.raises(ConfigError, match=named):
         refuse_nonsense(asked(**params), SIZE)
+
+
+def test_endless_patterns_are_refused_before_anybody_looks_closely() -> None:
+    longest = {"frequencies": [1.5] * 341, "shifts": [3] * 341, "precorrection": {"table": [0.5] * 256}}
+    refuse_endless(asked(pattern=longest))
+    refuse_endless(asked())
+    for endless in ([1] * 2048, [[1] * 30] * 80, {"a": [0] * 2048}, {str(k): k for k in range(2048)}):
+        with pytest.raises(ConfigError, match="2048"):
+            refuse_endless(asked(LiveStart, pattern={"codes": endless}))
 
 
 def refusal(*params: Any) -> str:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from scanner.endpoints import sibling
 from scanner.errors import ConfigError
-from scanner.wire import sibling
 from service.config import load_rig
 from service.daemon import run_daemon
 from service.sockets import refuse_files, refuse_taken, remove_sockets
