@@ -44,6 +44,7 @@ from scanner.stream import (
 )
 from scanner.wire import MAX_MESSAGE_BYTES, PROTOCOL
 from service.descriptors import raise_limit
+from service.kept_memory import keep_memory
 from service.logs import start_logging
 from service.work import Work
 
@@ -226,6 +227,7 @@ def main() -> int:
     parser.add_argument("--discard", action="store_true", help="check digests, decode nothing")
     given = parser.parse_args()
     start_logging("worker")
+    keep_memory()
     try:
         if given.serve:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
