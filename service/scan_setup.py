@@ -17,7 +17,7 @@ from scanner.errors import ConfigError, DecodeError, DeviceError, DeviceLost, Sy
 from scanner.geometry import Calibration, load_calibration
 from scanner.patterns import McpPattern, PatternSequence, ProjectorSize
 from scanner.sequencer import Rig, auto_exposure, measure_latency
-from scanner.sequencer.latency import Disagreement, disagreement
+from scanner.sequencer.latency import Disagreement, LateLight, disagreement
 from scanner.wire import ScanStart
 from service.rig_patterns import KnownRig, known_of
 from service.scan_patterns import check_length, pattern_for
@@ -112,6 +112,9 @@ class OpenRig:
             )
         except DeviceLost:
             raise
+        except LateLight as error:
+            found, self.disagreement = None, f"the rig file's latency_us is {_ms(latency)}; {error}: {error.hint}"
+            _log.warning("%s: %s", rig.projector.name, self.disagreement)
         except (ConfigError, SyncError, DeviceError) as error:  # the scan itself says what it cannot work with
             _log.info("%s: its latency was not checked: %s", rig.projector.name, error)
             return

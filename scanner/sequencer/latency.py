@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,10 @@ from scanner.sequencer.shots import BLACK, WHITE, Shot, Shots
 LONGEST_REFRESHES = 5
 """The slowest displays known (frame interpolation off) lag by four refreshes."""
 
+NEVER_NS = 1_000_000_000
+"""A picture that does not shine after a second never will: the longest that light is waited for to say that it came,
+too late."""
+
 STEADY = 0.04
 """Share of the contrast within which light counts as dark or as full, beyond noise."""
 
@@ -29,6 +34,9 @@ BLOCKS = 8
 
 MIN_CONTRAST_SIGMAS = 20.0
 """Contrast of a block's mean over its noise that makes 4 % of it visible."""
+
+LATE_CONTRAST = 0.04
+"""Of the camera's range: ten times the read noise of any camera, and a block's mean has less."""
 
 COARSE, FINE = 1, 10
 """Flips sampled all through to find the change, and flips sampled at its two ends."""
@@ -47,6 +55,8 @@ class _Sample:
     full: bool
     bound_ns: int
     """taken off at both ends"""
+    rolling_ns: int
+    """between the starts of the first row and the last"""
 
 
 def measure(
@@ -63,7 +73,8 @@ def measure(
 
     Raises:
         ConfigError: the projector cannot flip.
-        SyncError: black and white cannot be told apart, or the light changes later than any display's.
+        SyncError: black and white cannot be told apart.
+        LateLight: the light changes later than any display's.
         DeviceError: no frame came.
     """
     if projector.capabilities.kind is not ProjectorKind.FRAMEBUFFER:
@@ -76,16 +87,20 @@ def measure(
         for i in range(COARSE):
             samples += _burst(shots, scale, i * shots.exposure_ns // 2, longest)
         if not any(sample.full for sample in samples):
-            raise SyncError(
-                f"no light {longest / 1e6:.0f} ms after a flip to white",
-                device=projector.name,
-                hint="is frame interpolation or a slow image mode of the projector on? Turn it off",
-            )
+            raise _late(projector, longest)
         shots.light_delay_ns = min(longest, _end(samples)[1] + refresh)
         for i in range(FINE):
             samples += _burst(shots, scale, _where_next(samples, begin=i % 2 == 0), shots.light_delay_ns)
         shots.show(BLACK)
     return _intervals(samples, scale.tolerance)
+
+
+class LateLight(SyncError):
+    """Light follows a flip, but later than any display's."""
+
+    def data(self) -> dict[str, Any]:
+        """A `SyncError`'s, for those who know no other."""
+        return {**super().data(), "class": SyncError.__name__}
 
 
 @dataclass(frozen=True)
@@ -115,12 +130,17 @@ def disagreement(
     dark, then lit, and the least latency lies between, the second is seen once, just before the least latency: one
     that is too long by more than an exposure and `EARLIER_NS` is found out.
 
+    A camera that rolls sees a picture that sweeps down later than it came, by as long as it rolls at most: darkness is
+    believed up to so long before an exposure's end.
+
     Raises:
         ConfigError, SyncError, DeviceError: see `measure`.
+        LateLight: the light changes later than any display's, and than what is given.
     """
-    longest = LONGEST_REFRESHES * projector.capabilities.refresh_ns
+    refresh = projector.capabilities.refresh_ns
+    longest = max(LONGEST_REFRESHES * refresh, sum(interval.high_ns for interval in given) + refresh)
     with Shots(projector, camera, clock, settings=settings, trigger_mode=trigger_mode, light_delay_ns=longest) as shots:
-        scale = _Scale(shots, _exposure(shots, projector.capabilities.refresh_ns))
+        scale = _Scale(shots, _exposure(shots, refresh))
         samples = _burst(shots, scale, 0, longest)
         began, least = _began(samples, longest), given[0].low_ns
         before = least - _length(samples) - 4 * samples[0].bound_ns - EARLIER_NS
@@ -132,14 +152,18 @@ def disagreement(
     if not _off(given, began, changing):
         return None
     latency, settle = measure(projector, camera, clock, settings=settings, trigger_mode=trigger_mode)
-    off = _off(given, latency, latency.low_ns + settle.low_ns)
+    rolling = max(sample.rolling_ns for sample in samples)
+    off = _off(given, Interval(max(0, latency.low_ns - rolling), latency.high_ns), latency.low_ns + settle.low_ns)
     return Disagreement(latency, settle, off) if off else None
 
 
 def _began(samples: Sequence[_Sample], longest: int) -> Interval:
-    """When light began: behind the last exposure that was dark, before the end of the first that was not."""
+    """When light began: behind the last exposure that was dark, before the end of the first that was not.
+
+    Of an exposure that rolls the first row's end counts: what sweeps down comes to that one first.
+    """
     return Interval(
-        max((s.end_ns for s in samples if s.dark), default=0),
+        max((s.end_ns - s.rolling_ns for s in samples if s.dark), default=0),
         min((s.end_ns + 2 * s.bound_ns for s in samples if not s.dark), default=longest),
     )
 
@@ -165,6 +189,8 @@ class _Scale:
         noise = float(np.std(np.diff(white, axis=0)) / np.sqrt(2)) + 1e-3
         self.use = self.contrast > max(MIN_CONTRAST_SIGMAS * noise, 0.1 * float(self.contrast.max()), 1.0)
         if not self.use.any():
+            if _comes_late(shots):
+                raise _late(shots.projector, shots.light_delay_ns)
             raise SyncError(
                 f"black and white differ by {self.contrast.max():.1f} grey levels, noise is {noise:.1f}",
                 device=shots.camera.name,
@@ -175,6 +201,20 @@ class _Scale:
     def levels(self, shot: Shot) -> NDArray[np.float64]:
         """Of the blocks that are lit: 0 = black, 1 = white."""
         return np.asarray((_blocks(shot)[self.use] - self.black[self.use]) / self.contrast[self.use])
+
+
+def _late(projector: Projector, longest_ns: int) -> LateLight:
+    return LateLight(
+        f"light comes later than {longest_ns / 1e6:.0f} ms after a flip",
+        device=projector.name,
+        hint="turn off the projector's frame interpolation and slow image modes, or choose its game mode",
+    )
+
+
+def _comes_late(shots: Shots) -> bool:
+    """Whether black and white differ after all, `NEVER_NS` after each flip."""
+    black, white = (_blocks(shots.after(shots.show(image), NEVER_NS)) for image in (BLACK, WHITE))
+    return bool((white - black).max() > LATE_CONTRAST * shots.camera.capabilities.max_value)
 
 
 def _steady(shots: Shots, image: int, count: int) -> list[NDArray[np.float64]]:
@@ -203,21 +243,23 @@ def _burst(shots: Shots, scale: _Scale, delay_ns: int, until_ns: int) -> list[_S
     flip = shots.show(WHITE)
     samples: list[_Sample] = []
     while not samples or (samples[-1].start_ns < until_ns and not (len(samples) > 2 and samples[-3].full)):
-        samples.append(_sample(scale, shots.after(flip, delay_ns)))
+        samples.append(_sample(scale, shots.after(flip, delay_ns), shots.exposure_ns))
         # A camera still busy drops a trigger: the next comes when it can take one.
         period = shots.camera.capabilities.min_period_ns(shots.exposure_ns)
         delay_ns = samples[-1].start_ns + period + period // 20
     return samples
 
 
-def _sample(scale: _Scale, shot: Shot) -> _Sample:
+def _sample(scale: _Scale, shot: Shot, exposure_ns: int) -> _Sample:
     levels, bound, flip = scale.levels(shot), shot.exposure.bound_ns + shot.flip.bound_ns, shot.flip.t_ns
+    whole_ns = shot.exposure.end_ns - shot.exposure.start_ns
     return _Sample(
         shot.exposure.start_ns + bound - flip,
         shot.exposure.end_ns - bound - flip,
         bool(levels.max() < scale.tolerance),
         bool(levels.min() > 1 - scale.tolerance),
         bound,
+        max(0, whole_ns - exposure_ns),
     )
 
 

@@ -14,7 +14,7 @@ from scanner.clock import VirtualClock
 from scanner.devices import CameraCapabilities, Interval, TriggerMode
 from scanner.errors import ConfigError, SyncError
 from scanner.sequencer import measure_latency
-from scanner.sequencer.latency import Disagreement, disagreement
+from scanner.sequencer.latency import Disagreement, LateLight, disagreement
 
 DEVICE = "quick/board?seed=1"
 
@@ -85,15 +85,19 @@ def test_a_static_projector_has_no_latency() -> None:
 
 
 def against(
-    given_ms: tuple[float, float, float, float], projector: dict[str, Any]
+    given_ms: tuple[float, float, float, float],
+    projector: dict[str, Any],
+    of_camera: dict[str, Any] | None = None,
+    mode: TriggerMode | None = None,
 ) -> tuple[Disagreement | None, float]:
     """What is wrong with (latency from, to, settle from, to), and the seconds that it took to say."""
     clock = VirtualClock()
-    screen, camera = open_projector("simulated", DEVICE, projector, clock), open_camera("simulated", DEVICE, {}, clock)
+    screen = open_projector("simulated", DEVICE, projector, clock)
+    camera = open_camera("simulated", DEVICE, of_camera or {}, clock)
     begin = clock.now_ns()
     latency, settle = (Interval(round(1e6 * low), round(1e6 * high)) for low, high in (given_ms[:2], given_ms[2:]))
     try:
-        found = disagreement(screen, camera, clock, (latency, settle))
+        found = disagreement(screen, camera, clock, (latency, settle), trigger_mode=mode)
     finally:
         camera.close()
         screen.close()
@@ -133,3 +137,26 @@ def test_one_too_long_by_a_few_milliseconds_is_named_however_seldom_the_camera_l
         found, _ = against(given_ms, {"latency_us": 4200.0, "settle_us": 200.0, "modulation": modulation})
     assert found is not None
     assert found.off_ns == pytest.approx(1e6 * (given_ms[0] - 4.5), abs=1.2e6)
+
+
+@pytest.mark.parametrize(
+    ("readout_us", "mode"),
+    [(5000.0, TriggerMode.SOFTWARE), (5000.0, TriggerMode.FREE), (15_000.0, TriggerMode.SOFTWARE)],
+)
+def test_a_shutter_that_rolls_behind_a_sweep_is_no_latency_of_its_own(readout_us: float, mode: TriggerMode) -> None:
+    projector = {"scan": "rows", "latency_us": 9000.0}
+    camera = {"shutter": "rolling", "readout_us": readout_us}
+    assert against((8.8, 9.2, 16.8, 17.0), projector, camera, mode)[0] is None
+    found, _ = against((1, 2, 0, 0), {"latency_us": 30_000.0}, camera, mode)
+    assert found is not None
+    assert -28.2e6 < found.off_ns < -28.2e6 + 1e3 * readout_us + 8e6
+
+
+@pytest.mark.parametrize("given_ms", [(4, 5, 0, 1), (119, 121, 0, 1)])
+def test_light_that_comes_later_than_any_displays_is_called_late(given_ms: tuple[float, float, float, float]) -> None:
+    if given_ms[0] > 100:
+        assert against(given_ms, {"latency_us": 120_000.0})[0] is None
+    else:
+        with pytest.raises(LateLight, match="later than 83 ms") as error:
+            against(given_ms, {"latency_us": 120_000.0})
+        assert "frame interpolation" in (error.value.hint or "")

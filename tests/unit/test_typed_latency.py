@@ -80,3 +80,13 @@ def test_a_rig_whose_light_cannot_be_seen_is_not_refused_for_it() -> None:
     opened.measure_latency(clock)
     assert opened.disagreement is None
     opened.close()
+
+
+def test_light_later_than_any_displays_is_named_where_a_scan_fails_by_it() -> None:
+    clock = VirtualClock()
+    opened = rig(clock, latency_us=4000.0, settle_us=400.0, options={"latency_us": 150_000.0})
+    opened.measure_latency(clock)
+    opened.close()
+    assert opened.disagreement is not None
+    assert opened.disagreement.startswith("the rig file's latency_us is 4.0 ms; ")
+    assert "light comes later than 83 ms after a flip: turn off the projector's frame" in opened.disagreement
