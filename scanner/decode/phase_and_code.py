@@ -12,6 +12,7 @@ to the next a pixel further on, the number grows by one, but for edges of depth.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,12 @@ Two images that changed places make both bits jump at every border, however few 
 edge of depth that hides its borders and happens to lie halfway."""
 
 LEAST_BORDERS_OF_BIT = 100
+
+LEAST_HEALED = 100
+HEALED_OVER_BROKEN = 4
+"""Another order is believed where so many borders that jump are none in it, and so many times those that begin to jump:
+in the right order every border of both bits does. The healed ones are of two kinds at least: one edge of depth along
+the fringes may hide a border, and lie just so that it looks like another's."""
 
 MOST_BEYOND = 0.02
 """Of the pixels that show fringes, those whose cell lies beyond the projector, where no light comes from: none in nine
@@ -162,19 +169,17 @@ def require_code_order(
     """
     numbers = np.zeros(cells.shape, np.int32)
     numbers[sound] = np.floor((cells[sound] + 0.5) / cell_px)
-    borders, jumps, of_bits = 0, 0, np.zeros((32, 2), np.int64)
-    for here, there in (np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1]):
-        on_border = sound[here] & sound[there] & (numbers[here] != numbers[there])
-        one, other = numbers[here][on_border], numbers[there][on_border]
-        jumped = np.abs(one - other) > 1
-        borders += jumped.size
-        jumps += int(np.count_nonzero(jumped))
-        of_bits += _borders_of_bits(one, other, jumped)
+    pairs, counts = _borders(numbers, sound)
+    jumped = np.abs(pairs[0] - pairs[1]) > 1
+    borders, jumps = int(counts.sum()), int(counts[jumped].sum())
     said = f"along {axis} the Gray code jumps at"
     if borders >= LEAST_BORDERS and jumps > MOST_JUMPS * borders:
         said += f" {100 * jumps / borders:.0f} % of the borders of its cells"
-    elif gray and len(exchanged := _jumping_bits(of_bits)) > 1:
-        said += f" borders where one bit changes, of {len(exchanged)} bits"
+    elif gray and len(jumping := _jumping_bits(_borders_of_bits(pairs, counts, jumped))) > 1:
+        said += f" borders where one bit changes, of {len(jumping)} bits"
+    elif (exchanged := _exchanged_bits(pairs, counts, gray=gray)) is not None:
+        high, low = exchanged
+        said += f" borders that are none with the bits of {2**high} and {2**low} cells exchanged"
     elif beyond > MOST_BEYOND * (seen := beyond + np.count_nonzero(sound)):
         said = (
             f"along {axis} the Gray code names cells beyond the projector at {100 * beyond / seen:.0f} % of the pixels"
@@ -192,9 +197,50 @@ def _jumping_bits(borders: NDArray[np.int64]) -> NDArray[np.intp]:
     return np.flatnonzero(borders[:, 1] > MOST_JUMPS_OF_BIT * whole)
 
 
-def _borders_of_bits(one: NDArray[np.int32], other: NDArray[np.int32], jumped: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _borders(numbers: NDArray[np.int32], sound: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Each kind of border between cells, (2, B) smaller and larger number, and how many pixels it has, (B,)."""
+    found = []
+    for here, there in (np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1]):
+        on_border = sound[here] & sound[there] & (numbers[here] != numbers[there])
+        one, other = numbers[here][on_border].astype(np.int64), numbers[there][on_border]
+        found.append(np.minimum(one, other) << 32 | np.maximum(one, other))
+    kinds, counts = np.unique(np.concatenate(found), return_counts=True)
+    return np.stack([kinds >> 32, kinds & 0xFFFFFFFF]).astype(np.int32), counts
+
+
+def _borders_of_bits(
+    pairs: NDArray[np.int32], counts: NDArray[np.int64], jumped: NDArray[np.bool_]
+) -> NDArray[np.int64]:
     """(32, 2) borders at which this bit of the Gray code changes and no other, to the next cell and to one further."""
-    changed = (one ^ one >> 1) ^ (other ^ other >> 1)
+    words = pairs ^ pairs >> 1
+    changed = words[0] ^ words[1]
     alone = changed & (changed - 1) == 0
     bits = np.frexp(changed[alone].astype(np.float64))[1] - 1
-    return np.bincount(bits * 2 + jumped[alone], minlength=64).reshape(32, 2)
+    found = np.zeros(64, np.int64)
+    np.add.at(found, bits * 2 + jumped[alone], counts[alone])
+    return found.reshape(32, 2)
+
+
+def _exchanged_bits(pairs: NDArray[np.int32], counts: NDArray[np.int64], *, gray: bool) -> tuple[int, int] | None:
+    """Two bits, counted from the finest, whose exchange heals many borders and breaks few; None without such a pair."""
+    if not counts.size:
+        return None
+    words = pairs ^ pairs >> 1 if gray else pairs
+    jumped = np.abs(pairs[0] - pairs[1]) > 1
+    for low, high in combinations(range(int(pairs.max()).bit_length()), 2):
+        differ = (words >> low ^ words >> high) & 1
+        one, other = _number_of(words ^ (differ << low | differ << high), gray=gray)
+        jumps = np.abs(one - other) > 1
+        healed, broken = jumped & ~jumps, jumps & ~jumped
+        kinds = np.count_nonzero(counts[healed] > LEAST_HEALED / HEALED_OVER_BROKEN)
+        if kinds > 1 and counts[healed].sum() > max(LEAST_HEALED, HEALED_OVER_BROKEN * counts[broken].sum()):
+            return high, low
+    return None
+
+
+def _number_of(words: NDArray[np.int32], *, gray: bool) -> NDArray[np.int32]:
+    """The numbers of cells that have these code words."""
+    numbers = words.copy()
+    for shift in (1, 2, 4, 8, 16) if gray else ():
+        numbers ^= numbers >> shift
+    return numbers

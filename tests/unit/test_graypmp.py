@@ -231,16 +231,19 @@ def test_ripple_is_not_corrected_where_one_set_measures():
         without_ripple(decode(sequence, take(sequence)), sequence)
 
 
-@pytest.mark.parametrize("order", ["rotated", "reversed", "last two", "first two"])
-@pytest.mark.parametrize("axis", ["x", "y"])
-def test_code_frames_out_of_order_are_refused(axis, order):
-    sequence = PatternSequence(PROJECTOR, default_gray_pmp((axis,), PROJECTOR))
-    frames, code = take(sequence), list(sequence.fringes[4:])
+@pytest.mark.parametrize("order", ["rotated", "reversed", "last two", "first two", "second and third"])
+@pytest.mark.parametrize(("axis", "code"), [("x", "gray"), ("y", "gray"), ("x", "binary")])
+def test_code_frames_out_of_order_are_refused(axis, code, order):
+    pattern = default_gray_pmp((axis,), PROJECTOR)
+    sequence = PatternSequence(PROJECTOR, replace(pattern, gray=replace(pattern.gray, code=code)))
+    decode(sequence, frames := take(sequence))
+    code = list(sequence.fringes[4:])
     shown = {
         "rotated": code[1:] + code[:1],
         "reversed": code[::-1],
         "last two": [*code[:-2], code[-1], code[-2]],
         "first two": [code[1], code[0], *code[2:]],
+        "second and third": [code[0], code[2], code[1], *code[3:]],
     }[order]
     with pytest.raises(DecodeError, match=r"the Gray code (jumps at|names cells beyond).*not in the order described"):
         decode(sequence, frames | {to: frames[of] for to, of in zip(code, shown, strict=True)})
