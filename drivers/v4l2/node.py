@@ -153,6 +153,15 @@ def _describe(node: Node) -> VideoNode:
 
 def _links(target: Path) -> Iterator[str]:
     for place in ("by-id", "by-path"):
-        folder = DEVICES / "v4l" / place
-        if folder.is_dir():
-            yield from sorted(str(link) for link in folder.iterdir() if link.resolve() == target)
+        try:
+            links = sorted((DEVICES / "v4l" / place).iterdir())
+        except FileNotFoundError:
+            continue  # no device has one, or none has any more
+        yield from (str(link) for link in links if _leads_to(link, target))
+
+
+def _leads_to(link: Path, target: Path) -> bool:
+    try:
+        return link.resolve() == target
+    except OSError:
+        return False  # udev took it away meanwhile: another device, or this one's other node, was unplugged

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -219,6 +220,40 @@ def test_a_name_of_by_id_is_its_link(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         open_camera("v4l2", "video0", {}, VirtualClock())
 
 
+def _camera_of(kernel_driver: str) -> Callable[[ioctl.Node, int, Any], int]:
+    """What a node answers to who asks what it is."""
+
+    def answer(_: ioctl.Node, request: int, argument: Any) -> int:
+        assert request == v.QUERYCAP
+        argument.driver, argument.card = kernel_driver.encode(), b"Camera"
+        argument.capabilities = v.CAP_VIDEO_CAPTURE | v.CAP_STREAMING
+        return 0
+
+    return answer
+
+
+def test_a_link_that_goes_while_it_is_looked_at_hides_no_other(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Where one of a device's nodes is opened, udev may be at the other."""
+    places = tmp_path / "v4l/by-path"
+    places.mkdir(parents=True)
+    for index in (0, 1):
+        (tmp_path / f"video{index}").touch()
+        (places / f"port-video-index{index}").symlink_to(f"../../video{index}")
+    link_of = Path.resolve
+
+    def resolve(path: Path) -> Path:
+        if path.name == "port-video-index1":
+            raise FileNotFoundError(path)
+        return link_of(path)
+
+    monkeypatch.setattr(node, "DEVICES", tmp_path)
+    monkeypatch.setattr(Path, "resolve", resolve)
+    monkeypatch.setattr(ioctl.Node, "call", _camera_of("uvcvideo"))
+    opened, found = node.open_node(str(tmp_path / "video0"), "camera")
+    opened.close()
+    assert found.links == (str(places / "port-video-index0"),)
+
+
 @pytest.mark.parametrize(
     ("kernel_driver", "parameter", "said"),
     [
@@ -232,16 +267,9 @@ def test_of_a_uvc_camera_it_is_told_what_its_stamps_are(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kernel_driver: str, parameter: str | None, said: str | None
 ) -> None:
     """By what the node calls itself. Whatever that is, stamps are estimates until their delay was measured: above."""
-
-    def answer(_: ioctl.Node, request: int, argument: Any) -> int:
-        assert request == v.QUERYCAP
-        argument.driver, argument.card = kernel_driver.encode(), b"Camera"
-        argument.capabilities = v.CAP_VIDEO_CAPTURE | v.CAP_STREAMING
-        return 0
-
     (tmp_path / "video0").touch()
     monkeypatch.setattr(node, "DEVICES", tmp_path)
-    monkeypatch.setattr(ioctl.Node, "call", answer)
+    monkeypatch.setattr(ioctl.Node, "call", _camera_of(kernel_driver))
     monkeypatch.setattr(driver, "UVC_STAMPS", tmp_path / "hwtimestamps")
     if parameter is not None:
         (tmp_path / "hwtimestamps").write_text(f"{parameter}\n")
