@@ -12,8 +12,9 @@ length of error (mm), and the share of those eleven numbers within two stated si
 `planes`: rigs calibrated so measure boards at three depths (100 mm nearer, at the aim, 70 mm farther: the range of the
 poses), and tilted by 30 degrees both ways, by PMP and by MCP: flatness (worst of 9 places of a board: rms from the best
 plane), shape (rms after a rigid fit of a whole board to truth), position (rms against truth); inside, 7 px from edges.
-`sphere`: such rigs measure the ball before the board: radius less the true one; form as rms of the radial distances,
-and as the spread of 997 of 1000 of them (PF of VDI/VDE 2634-2), which is six times the noise.
+`sphere`: such rigs measure the ball before the board, by (1, 8, 64) x 8 or --shifts: radius less the true one; form as
+rms of the radial distances, as the thinnest shell that holds 95 of 100 (ISO 10360-8, dispersion), as the spread of
+997 of 1000 of them (PF of VDI/VDE 2634-2), and that of a perfect ball whose noise is the stated sigmas.
 `wedge`: the dissertation's own procedure, the wedge with 18 discs and the Hall model, then the board in rows: rms in
 depth in the wedge's frame, with and without the discs' correction for perspective.
 """
@@ -34,6 +35,7 @@ from drivers.registry import open_camera, open_projector
 from drivers.simulated.rigs import reference
 from drivers.simulated.rigs import rig as simulated_rig
 from drivers.simulated.targets import wedge_planes, wedge_points
+from scanner.calibration.figure_spread import noise_alone
 from scanner.calibration.hall import triangulate_hall
 from scanner.calibration.lens_slopes import lens_numbers
 from scanner.calibration.observe import LeftOut, Observation, observe_capture, observe_decoded
@@ -41,7 +43,7 @@ from scanner.calibration.problem import View
 from scanner.calibration.solve import SolveOptions, sigmas, solve
 from scanner.calibration.solve_hall import solve_hall
 from scanner.calibration.targets import parse_target
-from scanner.calibration.verification import sphere
+from scanner.calibration.verification import measured_sphere, sphere_figures, sphere_points
 from scanner.clock import VirtualClock
 from scanner.decode import decoder_for
 from scanner.devices import CameraSettings, TriggerMode
@@ -158,18 +160,24 @@ def planes(chosen):
 
 def spheres(chosen):
     radius = reference()["scenes"]["sphere_board"]["radius_mm"] * simulated_rig(chosen.rig).scale
-    print("calibration   radius error mm   form mm (rms)   form mm (PF, 99.7 %)   points")
+    print("calibration   radius error mm   rms mm   95 % mm   PF (99.7 %) mm   of noise alone mm   points")
     for seed in range(chosen.first, chosen.first + chosen.seeds):
         solution, true, _ = calibrated(chosen.rig, chosen.target, seed)
-        pattern = PmpPattern(axes=(true.phase_axis,), frequencies=(1.0, 8.0, 64.0), shifts=(8, 8, 8))
+        pattern = PmpPattern(axes=(true.phase_axis,), frequencies=(1.0, 8.0, 64.0), shifts=(chosen.shifts,) * 3)
         decoded, truth, _ = take(f"{chosen.rig}/sphere_board?seed={seed}", pattern)
         inside = cv2.erode(truth.lit.astype(np.uint8), np.ones((15, 15), np.uint8)).astype(bool)
         for name, rig in (("own", solution.geometry), ("true", true)):
-            xyz = triangulate(rig, rows=decoded.rows, columns=decoded.columns).xyz
-            xyz[~inside] = np.nan
-            found = sphere(xyz, 2 * radius)
+            made = triangulate(
+                rig, rows=decoded.rows, columns=decoded.columns,
+                sigma_rows=decoded.sigma_rows, sigma_columns=decoded.sigma_columns,
+            )  # fmt: skip
+            made.xyz[~inside] = np.nan
+            on = sphere_points(made.xyz, 2 * radius)
+            found = measured_sphere(on, 2 * radius)
+            noise = noise_alone(on, made.sigma_z, sphere_figures, round_=True)["form_mm"]
             print(
-                f"{name:11} {found.size_mm / 2:+17.4f} {found.rms_mm:15.4f} {found.form_mm:22.4f} {found.points:8}",
+                f"{name:11} {found.size_mm / 2:+17.4f} {found.rms_mm:8.4f} {found.shell_mm:9.4f} {found.form_mm:16.4f} "
+                f"{noise:19.4f} {found.points:8}",
                 flush=True,
             )
 
@@ -296,6 +304,8 @@ def main():
         else:
             command.add_argument("--rig", default="casey2011")
             command.add_argument("--target", default="charuco")
+            if name == "sphere":
+                command.add_argument("--shifts", type=int, default=8)
     chosen = parser.parse_args()
     chosen.work(chosen)
 

@@ -1,12 +1,13 @@
-"""What a calibration's covariance means for depth: its parameters are moved, pixels and coordinates stay as measured.
+"""What a calibration's covariance means for points: its parameters are moved, pixels and coordinates stay as measured.
 
-At a few of a scan's points: dz = -(dc / dp) / (dc / dz) dp, where c is the projector coordinate at which the point of
-depth z on the camera's ray is seen (implicit function theorem), and the variance of z is J C J' (JCGM 102:2011, 6.2).
+dz = -(dc / dp) / (dc / dz) dp, where c is the projector coordinate at which the point of depth z on the camera's ray is
+seen (implicit function theorem); with the ray of a moved camera that gives x and y. The variance of what depends on
+points is J C J' (JCGM 102:2011, 6.2), which `PointSpread` is the means for.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,41 +20,87 @@ POINTS = 49
 """Points asked, spread over those that the scan has."""
 
 
+@dataclass(frozen=True, eq=False)
+class PointSpread:
+    """What moves some points. slopes: (n, 3, k) mm by each of the k parameters; covariance: (k, k) of these."""
+
+    slopes: Array
+    covariance: Array
+
+    def draws(self, count: int, seed: int) -> Array:
+        """(count, n, 3) mm by which the points would be moved by other rigs that the covariance allows."""
+        sigmas = np.sqrt(np.clip(np.diag(self.covariance), 0, None))
+        free = np.flatnonzero(sigmas > 0)
+        # Focal lengths and third coefficients lie powers of ten apart: drawn as shares of their own sigmas.
+        correlation = self.covariance[np.ix_(free, free)] / np.outer(sigmas[free], sigmas[free])
+        values, vectors = np.linalg.eigh((correlation + correlation.T) / 2)
+        normal = np.random.default_rng(seed).normal(size=(count, len(free)))
+        steps = (normal * np.sqrt(np.clip(values, 0, None))) @ vectors.T * sigmas[free]
+        return np.asarray(np.einsum("nik,dk->dni", self.slopes[..., free], steps), dtype=np.float64)
+
+
 def depth_spread(calibration: Calibration, scan: Scan, axis: str) -> float | None:
     """1-sigma of depth that the calibration leaves, mm, rms over points of the scan; None where it is not known.
 
     Args:
         scan: with points. axis: whose coordinates told their depth.
     """
-    try:
-        read = read_covariance(calibration.extra.get("covariance"))
-    except ValueError:  # said when the file was read
+    if scan.xyz is None:
         return None
-    if read is None or scan.xyz is None:
-        return None
-    names, matrix = read.names, read.matrix
     valid = np.flatnonzero(scan.valid)
     if valid.size == 0:
         return None
     chosen = valid[np.linspace(0, valid.size - 1, min(POINTS, valid.size)).astype(np.intp)]
     y, x = np.unravel_index(chosen, scan.shape)
-    pixels, depth = np.stack([x, y], axis=-1).astype(np.float64), scan.xyz[y, x, 2].astype(np.float64)
-    member = 1 if axis == "y" else 0
-
-    def coordinate(rig: Calibration, z: Array) -> Array:
-        rays = np.concatenate([rig.camera.normalised(pixels), np.ones((len(pixels), 1))], axis=1)
-        found: Array = rig.projector.project(rig.to_projector(rays * z[:, None]))[:, member]
-        return found
-
-    by_depth = (coordinate(calibration, depth * 1.0005) - coordinate(calibration, depth * 0.9995)) / (0.001 * depth)
-    sigmas = np.sqrt(np.clip(np.diag(matrix), 0, None))
-    slopes = np.zeros((len(chosen), len(names)))
-    for k, (name, sigma) in enumerate(zip(names, sigmas, strict=True)):
-        if sigma > 0:
-            up, down = (coordinate(moved(calibration, name, step), depth) for step in (sigma, -sigma))
-            slopes[:, k] = -(up - down) / (2 * sigma) / by_depth
-    variance = np.einsum("ni,ij,nj->n", slopes, matrix, slopes)
+    spread = point_spread(
+        calibration, np.stack([x, y], axis=-1).astype(np.float64), scan.xyz[y, x].astype(np.float64), axis
+    )
+    if spread is None:
+        return None
+    of_depth = spread.slopes[:, 2]
+    variance = np.einsum("ni,ij,nj->n", of_depth, spread.covariance, of_depth)
     return float(np.sqrt(np.mean(np.clip(variance, 0, None))))
+
+
+def point_spread(calibration: Calibration, pixels: Array, xyz: Array, axis: str) -> PointSpread | None:
+    """How points depend on the calibration's parameters; None where it has no covariance that can be used.
+
+    Args:
+        pixels: (n, 2) px of the camera. xyz: (n, 3) mm, the points seen there. axis: whose coordinates told their
+            depth.
+    """
+    try:
+        read = read_covariance(calibration.extra.get("covariance"))
+    except ValueError:  # said when the file was read
+        return None
+    if read is None:
+        return None
+    depth = xyz[:, 2]
+    by_depth = (_seen(calibration, pixels, depth * 1.0005, axis) - _seen(calibration, pixels, depth * 0.9995, axis)) / (
+        0.001 * depth
+    )
+    rays = _rays(calibration, pixels)
+    slopes = np.zeros((len(pixels), 3, len(read.names)))
+    for k, (name, sigma) in enumerate(zip(read.names, np.sqrt(np.clip(np.diag(read.matrix), 0, None)), strict=True)):
+        if sigma <= 0:
+            continue
+        up, down = (moved(calibration, name, step) for step in (sigma, -sigma))
+        of_depth = -(_seen(up, pixels, depth, axis) - _seen(down, pixels, depth, axis)) / (2 * sigma) / by_depth
+        slopes[:, :, k] = rays * of_depth[:, None]
+        if name.startswith("camera."):
+            slopes[:, :, k] += depth[:, None] * (_rays(up, pixels) - _rays(down, pixels)) / (2 * sigma)
+    return PointSpread(slopes, read.matrix)
+
+
+def _rays(rig: Calibration, pixels: Array) -> Array:
+    """(n, 3): x / z, y / z, 1 of what is seen at camera pixels."""
+    return np.concatenate([rig.camera.normalised(pixels), np.ones((len(pixels), 1))], axis=1)
+
+
+def _seen(rig: Calibration, pixels: Array, depth: Array, axis: str) -> Array:
+    """(n,) projector coordinate at which points of these depths on the pixels' rays are seen."""
+    seen: Array = rig.projector.project(rig.to_projector(_rays(rig, pixels) * depth[:, None]))
+    return seen[:, 1 if axis == "y" else 0]
 
 
 def moved(calibration: Calibration, name: str, step: float) -> Calibration:

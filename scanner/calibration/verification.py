@@ -2,7 +2,7 @@
 
 Figures are of scans as they are, by the numbers: nothing is smoothed first. Of every feature three points in a
 thousand may be left out, as the guideline allows; what is no part of the feature (background, a foot) is told apart by
-its distance first, and the share of points used is reported.
+its distance first, and the share of points used is reported. How sure the figures are is `figure_spread`'s.
 """
 
 from __future__ import annotations
@@ -14,20 +14,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.calibration.detection import NotFound, detect
+from scanner.calibration.detection import Detection, NotFound, detect
+from scanner.calibration.features import (
+    Array,
+    belonging,
+    plane_distance,
+    plane_through,
+    sphere_distance,
+    sphere_through,
+    spread,
+)
 from scanner.calibration.targets import Target
 from scanner.errors import DecodeError
 
-Array = NDArray[np.float64]
-
 LEFT_OUT = 0.003
 """Share of points that may be left out (VDI/VDE 2634-2, 2012, sec. 6)."""
+OF_SHELL = 0.05
+"""Share that the shell of `Probing.shell_mm` leaves out (ISO 10360-8:2013, P_Form.Sph.D95%)."""
 FEWEST_POINTS = 500
-DRAWS = 400
-"""Random planes or spheres among which the feature is looked for: it is missed once in 10^20 if half of the points
-belong to it, and once in fifty if a fifth does."""
-GROSS_SPREADS = 8.0
-"""Distance from the feature, in units of the median one, from which a point belongs to something else."""
 OTHER_SIZES = 1.2 ** np.arange(-5.0, 6.0)
 """Where there is no sphere of the diameter given, one of so many times that is looked for, each to a tenth: a radius
 taken for a diameter, and scales that are wrong by as much"""
@@ -35,7 +39,6 @@ OTHER_SAMPLE = 4000
 """Points of a scan that are asked for it"""
 ROUND_SHARE = 0.02
 """Of its diameter, rms: what fits a sphere worse is something else that is round, as a head (4 to 7 %)"""
-SAMPLE = 20_000
 
 
 @dataclass(frozen=True)
@@ -54,10 +57,12 @@ class Flatness:
 
 @dataclass(frozen=True)
 class Probing:
-    """A sphere. form_mm: spread of the radial distances, 99.7 % of the points (PF); size_mm: diameter less the stated
-    one (PS), None where none was stated; rms_mm: of the radial distances."""
+    """A sphere. form_mm: spread of the radial distances, 99.7 % of the points (PF); shell_mm: the same of 95 % (the
+    dispersion value of ISO 10360-8); size_mm: diameter less the stated one (PS), None where none was stated; rms_mm: of
+    the radial distances."""
 
     form_mm: float
+    shell_mm: float
     size_mm: float | None
     diameter_mm: float
     rms_mm: float
@@ -86,6 +91,16 @@ class Repeatability:
     points: int
 
 
+@dataclass(frozen=True, eq=False)
+class FeaturePoints:
+    """Of a scan, those that belong to one feature. points: (n, 3) mm; at: (n,) their places in the scan, flat; used:
+    share of the scan's points."""
+
+    points: Array
+    at: NDArray[np.intp]
+    used: float
+
+
 def flat_board(xyz: NDArray[Any]) -> Flatness:
     """Measure a flat board.
 
@@ -95,24 +110,36 @@ def flat_board(xyz: NDArray[Any]) -> Flatness:
     Raises:
         DecodeError: too few points.
     """
-    points = _finite(xyz)
-    used = _belonging(points, _plane_distance, 3)
-    on = points[used]
-    centre, normal, axes = _plane(on)
+    return measured_board(board_points(xyz))
+
+
+def board_points(xyz: NDArray[Any]) -> FeaturePoints:
+    """The points of the largest plane. Args, Raises: as `flat_board`."""
+    points, at = _finite(xyz)
+    used = belonging(points, plane_distance, 3)
+    return FeaturePoints(points[used], at[used], float(used.mean()))
+
+
+def measured_board(on: FeaturePoints) -> Flatness:
+    """Measure a board by its points."""
+    return Flatness(**board_figures(on.points), points=len(on.points), used=on.used)
+
+
+def board_figures(on: Array) -> dict[str, float]:
+    """What `Flatness` says of points (n, 3) of a board, by name."""
+    centre, normal, axes = plane_through(on)
     off = (on - centre) @ normal
     across = (on - centre) @ axes.T
     size = float(np.linalg.norm(across, axis=1).max())
     terms = np.column_stack(((across / size) ** 2, across, np.ones(len(on))))
-    bend = np.linalg.lstsq(terms, off, rcond=None)[0][:2].mean()
-    return Flatness(
-        flatness_mm=_spread(off),
-        rms_mm=float(np.sqrt((off**2).mean())),
-        bow_mm=float(bend),
-        tilt_deg=float(np.degrees(np.arccos(np.clip(abs(normal[2]), 0, 1)))),
-        distance_mm=float(abs(centre @ normal)),
-        points=len(on),
-        used=float(used.mean()),
-    )
+    bend = np.linalg.solve(terms.T @ terms, terms.T @ off)[:2].mean()
+    return {
+        "flatness_mm": spread(off, LEFT_OUT),
+        "rms_mm": float(np.sqrt((off**2).mean())),
+        "bow_mm": float(bend),
+        "tilt_deg": float(np.degrees(np.arccos(np.clip(abs(normal[2]), 0, 1)))),
+        "distance_mm": float(abs(centre @ normal)),
+    }
 
 
 def plane_of(xyz: NDArray[Any]) -> tuple[Array, Array]:
@@ -121,8 +148,7 @@ def plane_of(xyz: NDArray[Any]) -> tuple[Array, Array]:
     Raises:
         DecodeError: too few points.
     """
-    points = _finite(xyz)
-    centre, normal, _ = _plane(points[_belonging(points, _plane_distance, 3)])
+    centre, normal, _ = plane_through(board_points(xyz).points)
     return centre, -np.sign(normal @ centre) * normal
 
 
@@ -136,27 +162,45 @@ def sphere(xyz: NDArray[Any], diameter_mm: float | None = None) -> Probing:
     Raises:
         DecodeError: too few points, or nothing round of that size among them.
     """
-    points = _finite(xyz)
+    return measured_sphere(sphere_points(xyz, diameter_mm), diameter_mm)
+
+
+def sphere_points(xyz: NDArray[Any], diameter_mm: float | None = None) -> FeaturePoints:
+    """The points of a sphere. Args, Raises: as `sphere`."""
+    points, at = _finite(xyz)
     reach = 0.7 * diameter_mm if diameter_mm is not None else 0.3 * float(np.ptp(points, axis=0).max())
-    used = _belonging(points, _sphere_distance(diameter_mm), 4, reach)
+    used = belonging(points, sphere_distance(diameter_mm), 4, reach)
     if used.sum() < FEWEST_POINTS:
         raise _no_sphere(points, int(used.sum()), diameter_mm)
-    on = points[used]
-    centre, radius = _sphere(on)
-    off = np.linalg.norm(on - centre, axis=1) - radius
-    rms = float(np.sqrt((off**2).mean()))
-    if rms > ROUND_SHARE * 2 * radius:
+    figures = sphere_figures(points[used])
+    if figures["rms_mm"] > ROUND_SHARE * figures["diameter_mm"]:
         raise _no_sphere(points, 0, diameter_mm)
-    x, y, z = (float(c) for c in centre)
+    return FeaturePoints(points[used], at[used], float(used.mean()))
+
+
+def measured_sphere(on: FeaturePoints, diameter_mm: float | None = None) -> Probing:
+    """Measure a sphere by its points."""
+    figures = sphere_figures(on.points)
+    x, y, z = (float(c) for c in sphere_through(on.points)[0])
     return Probing(
-        form_mm=_spread(off),
-        size_mm=None if diameter_mm is None else 2 * radius - diameter_mm,
-        diameter_mm=2 * radius,
-        rms_mm=rms,
+        **figures,
+        size_mm=None if diameter_mm is None else figures["diameter_mm"] - diameter_mm,
         centre_mm=(x, y, z),
-        points=len(on),
-        used=float(used.mean()),
+        points=len(on.points),
+        used=on.used,
     )
+
+
+def sphere_figures(on: Array) -> dict[str, float]:
+    """What `Probing` says of points (n, 3) of a sphere, by name."""
+    centre, radius = sphere_through(on)
+    off = np.linalg.norm(on - centre, axis=1) - radius
+    return {
+        "form_mm": spread(off, LEFT_OUT),
+        "shell_mm": spread(off, OF_SHELL),
+        "diameter_mm": 2 * radius,
+        "rms_mm": float(np.sqrt((off**2).mean())),
+    }
 
 
 def target_length(
@@ -173,6 +217,11 @@ def target_length(
     Raises:
         DecodeError: the target is not there, or the ends of its row have no points.
     """
+    return length_between(target_ends(albedo, xyz, target)[1], target, length_mm)
+
+
+def target_ends(albedo: NDArray[Any], xyz: NDArray[Any], target: Target) -> tuple[Detection, tuple[Array, Array]]:
+    """What is seen of a target, and the ends of its longest row, (3,) mm each. Args, Raises: as `target_length`."""
     found = detect(albedo, target)
     if isinstance(found, NotFound):
         raise DecodeError(f"the target was not found: {found.reason}")
@@ -186,6 +235,11 @@ def target_length(
                 hint="scan the whole target; points fall out where dark squares are lost: grey ones keep theirs",
             )
         ends.append(point)
+    return found, (ends[0], ends[1])
+
+
+def length_between(ends: tuple[Array, Array], target: Target, length_mm: float | None = None) -> LengthError:
+    """The length between the ends of a target's longest row. length_mm: as in `target_length`."""
     measured = float(np.linalg.norm(ends[1] - ends[0]))
     stated = target.longest_mm if length_mm is None else length_mm
     return LengthError(measured - stated, measured, stated)
@@ -224,18 +278,28 @@ def local_point(xyz: NDArray[Any], at: Array, reach: int = 4) -> Array | None:
 
     None where fewer than half of the pixels have a point.
     """
+    found = local_weights(xyz, at, reach)
+    if found is None:
+        return None
+    rows, columns, weights = found
+    return np.asarray(weights @ xyz[rows, columns].astype(np.float64), dtype=np.float64)
+
+
+def local_weights(
+    xyz: NDArray[Any], at: Array, reach: int = 4
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Array] | None:
+    """(n,) rows, columns and weights of the points whose sum is `local_point`; None where there is none."""
     column, row = round(float(at[0])), round(float(at[1]))
     height, width = xyz.shape[:2]
     if not (reach <= column < width - reach and reach <= row < height - reach):
         return None
-    window = np.s_[row - reach : row + reach + 1, column - reach : column + reach + 1]
-    values = xyz[window].reshape(-1, 3).astype(np.float64)
-    v, u = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).astype(np.float64)
-    good = np.isfinite(values).all(axis=1)
+    v, u = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
+    good = np.isfinite(xyz[row + v, column + u]).all(axis=1)
     if good.mean() < 0.5:
         return None
-    terms = np.column_stack((np.ones(good.sum()), u[good] + column - at[0], v[good] + row - at[1]))
-    return np.asarray(np.linalg.lstsq(terms, values[good], rcond=None)[0][0], dtype=np.float64)
+    rows, columns = row + v[good], column + u[good]
+    terms = np.column_stack((np.ones(good.sum()), columns - at[0], rows - at[1]))
+    return rows, columns, np.linalg.pinv(terms)[0]
 
 
 def plain(result: Any) -> dict[str, Any]:
@@ -243,83 +307,14 @@ def plain(result: Any) -> dict[str, Any]:
     return asdict(result)
 
 
-def _finite(xyz: NDArray[Any]) -> Array:
+def _finite(xyz: NDArray[Any]) -> tuple[Array, NDArray[np.intp]]:
+    """(n, 3) points, and (n,) their places in the scan."""
     flat = np.asarray(xyz).reshape(-1, 3)
-    points: Array = flat[np.isfinite(flat).all(axis=1)].astype(np.float64)
+    at = np.flatnonzero(np.isfinite(flat).all(axis=1))
+    points: Array = flat[at].astype(np.float64)
     if len(points) < FEWEST_POINTS:
         raise DecodeError(f"{len(points)} points are too few to measure a feature by, {FEWEST_POINTS} are needed")
-    return points
-
-
-def _spread(off: Array) -> float:
-    """Smallest interval that holds all but the share that may be left out."""
-    ordered = np.sort(off)
-    out = int(LEFT_OUT * len(off))
-    spans = ordered[len(off) - 1 - out :] - ordered[: out + 1]
-    return float(spans.min())
-
-
-def _belonging(points: Array, distances: Any, needed: int, reach: float = np.inf) -> NDArray[np.bool_]:
-    """Points of the feature that most points are near to: the best of random ones, then gross ones out.
-
-    Random ones are drawn within `reach` of each other: a ball is a small part of the wall it stands before.
-    """
-    generator = np.random.default_rng(2634)
-    sample = points if len(points) <= SAMPLE else generator.choice(points, SAMPLE, replace=False)
-    best, threshold = None, 0.01 * float(np.ptp(sample, axis=0).max())
-    most = -1
-    for _ in range(DRAWS):
-        near = sample
-        if np.isfinite(reach):
-            near = sample[np.linalg.norm(sample - sample[generator.integers(len(sample))], axis=1) < reach]
-        off = distances(generator.choice(near, needed, replace=False), sample) if len(near) >= needed else None
-        if off is None:
-            continue
-        count = int((np.abs(off) < threshold).sum())
-        if count > most:
-            best, most = sample[np.abs(off) < threshold], count
-    if best is None or len(best) < 4 * needed:
-        return np.zeros(len(points), dtype=bool)
-    used = np.zeros(len(points), dtype=bool)
-    for _ in range(5):
-        off = distances(best, points)
-        if off is None:
-            break
-        typical = float(np.median(np.abs(off[np.abs(off) < threshold]))) if (np.abs(off) < threshold).any() else 0.0
-        used = np.abs(off) < max(GROSS_SPREADS * 1.4826 * typical, 1e-6)
-        best = points[used] if used.sum() <= SAMPLE else generator.choice(points[used], SAMPLE, replace=False)
-    return used
-
-
-def _plane(points: Array) -> tuple[Array, Array, Array]:
-    """Centre, unit normal, and two unit axes (2, 3) in the plane."""
-    centre = points.mean(axis=0)
-    _, vectors = np.linalg.eigh((points - centre).T @ (points - centre))
-    return centre, vectors[:, 0], vectors[:, 1:].T
-
-
-def _plane_distance(given: Array, points: Array) -> Array:
-    centre, normal, _ = _plane(given)
-    return np.asarray((points - centre) @ normal, dtype=np.float64)
-
-
-def _sphere(points: Array) -> tuple[Array, float]:
-    """Centre and radius: algebraic start, then Gauss-Newton on the radial distances."""
-    middle = points.mean(axis=0)
-    q = points - middle
-    terms = np.column_stack((2 * q, np.ones(len(q))))
-    solution = np.linalg.lstsq(terms, (q**2).sum(axis=1), rcond=None)[0]
-    centre = solution[:3]
-    radius = float(np.sqrt(max(solution[3] + centre @ centre, 1e-12)))
-    for _ in range(10 if len(points) > 4 else 0):
-        away = q - centre
-        length = np.linalg.norm(away, axis=1)
-        jacobian = np.column_stack((-away / length[:, None], -np.ones(len(q))))
-        step = np.linalg.lstsq(jacobian, -(length - radius), rcond=None)[0]
-        centre, radius = centre + step[:3], radius + float(step[3])
-        if np.abs(step).max() < 1e-9:
-            break
-    return middle + centre, radius
+    return points, at
 
 
 def _no_sphere(points: Array, on_best: int, diameter_mm: float | None) -> DecodeError:
@@ -328,10 +323,10 @@ def _no_sphere(points: Array, on_best: int, diameter_mm: float | None) -> Decode
         return DecodeError(f"no sphere among the points: {on_best} lie on the best one")
     few = points[:: -(-len(points) // OTHER_SAMPLE)]
     for other in sorted(diameter_mm * OTHER_SIZES, key=lambda size: abs(float(np.log(size / diameter_mm)))):
-        used = _belonging(few, _sphere_distance(other), 4, 0.7 * other)
+        used = belonging(few, sphere_distance(other), 4, 0.7 * other)
         if used.sum() < FEWEST_POINTS // 5:
             continue
-        centre, radius = _sphere(few[used])
+        centre, radius = sphere_through(few[used])
         rms = float(np.sqrt(np.mean((np.linalg.norm(few[used] - centre, axis=1) - radius) ** 2)))
         if rms < ROUND_SHARE * 2 * radius:
             doubled = abs(radius / diameter_mm - 1) < 0.1
@@ -347,13 +342,3 @@ def _no_sphere(points: Array, on_best: int, diameter_mm: float | None) -> Decode
         f"{OTHER_SIZES[-1]:.1f} times that",
         hint="keep its surroundings out of the scan: fringed decode --box or --depth",
     )
-
-
-def _sphere_distance(diameter_mm: float | None) -> Any:
-    def distance(given: Array, points: Array) -> Array | None:
-        centre, radius = _sphere(given)
-        if diameter_mm is not None and abs(2 * radius / diameter_mm - 1) > 0.1:
-            return None
-        return np.asarray(np.linalg.norm(points - centre, axis=1) - radius, dtype=np.float64)
-
-    return distance

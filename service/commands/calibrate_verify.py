@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -13,11 +12,6 @@ from service.commands.calibrate_marks import region_given
 from service.commands.calibrate_solve import Replace
 from service.commands.options import AsJson, output_path
 from service.terminal import print_error, print_facts, print_json, print_table, progress_lines
-
-if TYPE_CHECKING:
-    from scanner.calibration.marks import Marks
-    from scanner.calibration.targets import Target
-    from scanner.scan import Scan
 
 
 def verify(
@@ -54,9 +48,15 @@ def verify(
     tolerance: Annotated[
         float | None, typer.Option(metavar="MM", min=0, max=1e4, help="Exit status 1 if an error is larger than this.")
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Calibration that made the scans. Default: the one their captures keep."),
+    ] = None,
     as_json: AsJson = False,
 ) -> int:
     """Measure known features in scans, in the words of VDI/VDE 2634 part 2. All lengths are mm.
+
+    Each figure has an expanded uncertainty (k = 2): of the calibration, by its covariance, and of the points used.
 
     \b
     Examples:
@@ -83,9 +83,10 @@ def verify(
         from scanner.calibration.marks import load_marks  # noqa: PLC0415
         from scanner.calibration.targets import parse_target  # noqa: PLC0415
         from scanner.calibration.verification import plain, repeatability  # noqa: PLC0415
+        from scanner.calibration.verified import Wanted, verified  # noqa: PLC0415
         from scanner.scan import load_scan  # noqa: PLC0415
 
-        wanted = _Wanted(
+        wanted = Wanted(
             flat,
             sphere,
             None if target is None else parse_target(target),
@@ -96,7 +97,7 @@ def verify(
         results, clouds = [], []
         for number, folder in enumerate(scans):
             scan = load_scan(folder)
-            measured = _measured(folder, scan, wanted)
+            measured = verified(folder, scan, wanted, calibration)
             unsure = (scan.report.get("uncertainty") or {}).get("systematic_mm")
             results.append({"scan": str(folder), "systematic_mm": unsure, **measured})
             if repeat and scan.xyz is not None:
@@ -197,65 +198,36 @@ def _refuse_twice(scans: list[Path]) -> None:
             seen[key] = folder
 
 
-@dataclass(frozen=True)
-class _Wanted:
-    """What is to be measured in each scan."""
-
-    flat: bool
-    sphere_mm: float | None
-    target: Target | None
-    length_mm: float | None
-    marks: Marks | None
-    edge: tuple[int, int, int, int] | None
-
-
-def _measured(folder: Path, scan: Scan, wanted: _Wanted) -> dict[str, Any]:
-    from scanner.calibration import verification  # noqa: PLC0415
-    from scanner.calibration.edges import edge_width  # noqa: PLC0415
-    from scanner.calibration.marks import measured_marks  # noqa: PLC0415
-    from scanner.errors import DecodeError  # noqa: PLC0415
-
-    if scan.xyz is None:
-        raise DecodeError(f"{folder} has no points", hint="decode it with a calibration: fringed decode --calibration")
-    plain = verification.plain
-    found: dict[str, Any] = {}
-    if wanted.flat:
-        found["flat"] = plain(verification.flat_board(scan.xyz))
-    if wanted.sphere_mm is not None:
-        found["sphere"] = plain(verification.sphere(scan.xyz, wanted.sphere_mm))
-    if wanted.target is not None:
-        found["length"] = plain(verification.target_length(scan.albedo, scan.xyz, wanted.target, wanted.length_mm))
-    if wanted.edge is not None:
-        x, y, width, height = wanted.edge
-        found["edge"] = plain(edge_width(scan.xyz[y : y + height, x : x + width]))
-    if wanted.marks is not None:
-        found["marks"] = measured_marks(wanted.marks, scan.albedo, scan.xyz)
-    return found
+def _errors(document: dict[str, Any]) -> list[tuple[float, float | None]]:
+    """All errors that a tolerance is for, mm, with their expanded uncertainty; None: unknown. No width of edges."""
+    errors: list[tuple[float, float | None]] = []
+    if "repeatability" in document:
+        found = document["repeatability"]
+        sure = found["depth_mm"] / (2 * (found["scans"] - 1) * found["points"]) ** 0.5  # of a standard deviation
+        errors.append((found["depth_mm"], 2 * sure))
+    for one in document["scans"]:
+        for kind, names in (("flat", ("flatness_mm",)), ("sphere", ("form_mm", "size_mm")), ("length", ("error_mm",))):
+            if kind in one:
+                errors += [(abs(one[kind][name]), one[kind]["uncertainty"][name]["expanded"]) for name in names]
+        if "marks" in one:
+            plate = (one["marks"].get("plate") or {}).get("offset_mm") or 0.0
+            errors += [(one["marks"].get("largest_mm", 0.0), None), (abs(plate), None)]
+    return errors
 
 
 def _worst(document: dict[str, Any]) -> float:
-    """The largest of all errors, mm: flatness, form, size, length, repeatability, marks. An edge's width is none."""
-    errors = [document["repeatability"]["depth_mm"]] if "repeatability" in document else []
-    for one in document["scans"]:
-        errors += [one["flat"]["flatness_mm"]] if "flat" in one else []
-        errors += [one["sphere"]["form_mm"], abs(one["sphere"]["size_mm"])] if "sphere" in one else []
-        errors += [abs(one["length"]["error_mm"])] if "length" in one else []
-        if "marks" in one:
-            errors += [
-                one["marks"].get("largest_mm", 0.0),
-                abs((one["marks"].get("plate") or {}).get("offset_mm") or 0),
-            ]
-    return float(max(errors, default=0.0))
+    """The largest of all errors, mm."""
+    return float(max((error for error, _ in _errors(document)), default=0.0))
 
 
 def _met(document: dict[str, Any], worst: float, tolerance: float) -> str:
-    """What a tolerance that is met does not say: errors are compared as measured."""
-    known = [one["systematic_mm"] for one in document["scans"] if one["systematic_mm"] is not None]
-    unsure = f"{max(known):.4f} mm of depth, 1 sigma" if known else "which the scans do not tell"
-    return (
-        f"the largest error, {worst:.4f} mm, is within {tolerance:g} mm as measured; that ignores the scans' "
-        f"systematic uncertainty ({unsure})"
-    )
+    """What a tolerance that is met does not say: errors are compared as measured (ISO 14253-1 would have U added)."""
+    errors = _errors(document)
+    said = f"the largest error, {worst:.4f} mm, is within {tolerance:g} mm as measured; "
+    if any(expanded is None for _, expanded in errors):
+        return said + "whether it is with its uncertainty is not known"
+    most = max(error + (expanded or 0.0) for error, expanded in errors)
+    return said + f"with its expanded uncertainty (k = 2), {most:.4f} mm, it is {'too' if most <= tolerance else 'not'}"
 
 
 def _cells_of(kind: str, values: dict[str, Any]) -> dict[str, Any]:
@@ -265,7 +237,8 @@ def _cells_of(kind: str, values: dict[str, Any]) -> dict[str, Any]:
         plate = {f"plate_{name}": value for name, value in (values.get("plate") or {}).items()}
         left_out = () if values["points"] else ("seen",)
         shown = {name: value for name, value in values.items() if name not in left_out} | plate
-    return {name: value for name, value in shown.items() if isinstance(value, int | float)}
+    spreads = values.get("uncertainty", {})
+    return {name: _cell(value, spreads.get(name)) for name, value in shown.items() if isinstance(value, int | float)}
 
 
 def _show(document: dict[str, Any]) -> None:
@@ -274,7 +247,7 @@ def _show(document: dict[str, Any]) -> None:
         if not rows:
             continue
         names = list(dict.fromkeys(name for _, values in rows for name in values))
-        cells = ([scan, *(_cell(values.get(name)) for name in names)] for scan, values in rows)
+        cells = ([scan, *(values.get(name, "-") for name in names)] for scan, values in rows)
         print_table(kind, ("scan", *(name.replace("_", " ") for name in names)), cells)
     for one in document["scans"]:
         if (said := one.get("marks", {}).get("warning")) is not None:
@@ -282,16 +255,32 @@ def _show(document: dict[str, Any]) -> None:
     facts = [(name.replace("_", " "), _cell(value)) for name, value in document.get("repeatability", {}).items()]
     facts.append(("largest error", f"{document['largest_error_mm']:.4f} mm, as measured"))
     for one in document["scans"]:
+        if "coverage_factor" in one:
+            facts.append(("+-", f"{_of_uncertainty(one)}: {one['scan']}"))
         unsure = one["systematic_mm"]
         said = "not told" if unsure is None else f"{unsure:.4f} mm of depth (1 sigma)"
         facts.append(("systematic", f"{said}, in none of these figures: {one['scan']}"))
     print_facts("verification", facts)
 
 
-def _cell(value: float | None) -> str:
+def _of_uncertainty(one: dict[str, Any]) -> str:
+    """What the uncertainties of a scan's figures contain, and why they are unknown where they are."""
+    if one["unknown"] is None:
+        return "expanded uncertainty, k = 2: the calibration's covariance, and the points"
+    parts = [one[kind]["uncertainty"] for kind in ("flat", "sphere", "length") if kind in one]
+    largest = max(
+        (s["random"] for part in parts for n, s in part.items() if n.endswith("_mm") and s["random"]), default=0
+    )
+    return f"unknown, {one['unknown']} (the points' own part, k = 2: up to {2 * largest:.4f} mm)"
+
+
+def _cell(value: float | None, spread: dict[str, float | None] | None = None) -> str:
     if value is None:
         return "-"
-    return f"{value:,}" if isinstance(value, int) else f"{value:.4f}"
+    shown = f"{value:,}" if isinstance(value, int) else f"{value:.4f}"
+    if spread is None:
+        return shown
+    return f"{shown} +- {'unknown' if spread['expanded'] is None else format(spread['expanded'], '.4f')}"
 
 
 def _both(pmp: Path, single: Path) -> tuple[Any, Any, float, str]:

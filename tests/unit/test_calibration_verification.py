@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from scanner.calibration import figure_spread
 from scanner.calibration.mcp_phase import mcp_phase
 from scanner.calibration.targets import parse_target
 from scanner.calibration.verification import flat_board, local_point, repeatability, sphere, target_length
@@ -78,6 +79,8 @@ def test_sphere_form_and_size() -> None:
     assert found.diameter_mm == pytest.approx(50.0, abs=0.02)
     assert found.size_mm == pytest.approx(found.diameter_mm - 50.0)
     assert found.rms_mm == pytest.approx(0.03, rel=0.05)
+    # 99.7 % and 95 % of a Gaussian lie within 5.94 and 3.92 sigma.
+    assert (found.form_mm, found.shell_mm) == pytest.approx((5.94 * 0.03, 3.92 * 0.03), rel=0.07)
     assert found.centre_mm == pytest.approx((0, 0, 400), abs=0.02)
     assert 0.2 < found.used < 0.6
     larger = sphere(ball(), 49.9)
@@ -225,7 +228,8 @@ def save(folder: Path, xyz: np.ndarray | None, albedo: np.ndarray | None = None,
     return folder
 
 
-def test_verify_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verify_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(figure_spread, "DRAWS", 10)  # what they tell is test_figure_spread's
     boards = [str(save(tmp_path / f"b{k}", board(0.02, seed=k))) for k in range(3)]
     assert main(["calibrate", "verify", *boards, "--flat", "--repeat", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -247,13 +251,13 @@ def test_verify_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert main(["calibrate", "verify", ball_folder, "--sphere", "50", "--tolerance", "0.2"]) == 0
     shown = capsys.readouterr()
     assert "not told, in none of these figures" in " ".join(shown.out.split())
-    assert "that ignores the scans' systematic uncertainty (which the scans do not tell)" in shown.err
+    assert "+- unknown" in shown.out
+    assert "whether it is with its uncertainty is not known" in shown.err
     budget = {"format": "fringed-report", "version": 1, "uncertainty": {"systematic_mm": 0.29}}
     (tmp_path / "ball" / "report.json").write_text(json.dumps(budget))
     assert main(["calibrate", "verify", ball_folder, "--sphere", "50", "--tolerance", "0.2"]) == 0
     shown = capsys.readouterr()
     assert "0.2900 mm of depth (1 sigma), in none of these figures" in " ".join(shown.out.split())
-    assert "uncertainty (0.2900 mm of depth, 1 sigma)" in shown.err
     albedo, xyz = scanned_target()
     row = str(save(tmp_path / "target", xyz, albedo.astype(np.float32)))
     capsys.readouterr()

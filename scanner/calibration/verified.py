@@ -1,0 +1,147 @@
+"""One scan verified: every feature that is asked for, measured, and how sure its figures are. Plain data comes out.
+
+The scan's calibration is the one that its capture keeps, if it has the name that the report has and its points are
+those of the scan; another one would give uncertainties of another rig.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scanner.calibration.edges import edge_width
+from scanner.calibration.figure_spread import COVERAGE_FACTOR, Rig, noise_alone, spread_of_figures, spread_of_length
+from scanner.calibration.marks import Marks, measured_marks
+from scanner.calibration.targets import Target
+from scanner.calibration.verification import (
+    FeaturePoints,
+    board_figures,
+    board_points,
+    length_between,
+    measured_board,
+    measured_sphere,
+    plain,
+    sphere_figures,
+    sphere_points,
+    target_ends,
+)
+from scanner.capture import Capture
+from scanner.errors import DecodeError, ScannerError
+from scanner.geometry import Calibration, load_calibration
+from scanner.scan import Scan
+
+SAME_PX = 0.05
+"""Projector px by which points may miss their coordinates under the scan's own calibration: float32 leaves a
+thousandth. Points of both axes lie between the two: noise, as it is stated, comes on top."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is to be measured in each scan."""
+
+    flat: bool = False
+    sphere_mm: float | None = None
+    target: Target | None = None
+    length_mm: float | None = None
+    marks: Marks | None = None
+    edge: tuple[int, int, int, int] | None = None
+
+
+def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None) -> dict[str, Any]:
+    """The figures of one scan, by kind, each with its uncertainties; and what these leave out.
+
+    Args:
+        folder: of the scan. given: a calibration file to take in place of its capture's.
+
+    Raises:
+        DecodeError: the scan has no points, or none of a feature.
+        CalibrationError: the calibration file given cannot be read, or is not the scan's.
+    """
+    if scan.xyz is None:
+        raise DecodeError(f"{folder} has no points", hint="decode it with a calibration: fringed decode --calibration")
+    found: dict[str, Any] = {}
+    rig, why = rig_of(folder, scan, given)
+    if wanted.flat:
+        board = board_points(scan.xyz)
+        found["flat"] = plain(measured_board(board)) | _of_noise(board, scan, "flatness_mm")
+        found["flat"]["uncertainty"] = _spreads(spread_of_figures(board, scan.shape[1], board_figures, rig))
+    if wanted.sphere_mm is not None:
+        ball = sphere_points(scan.xyz, wanted.sphere_mm)
+        spreads = _spreads(spread_of_figures(ball, scan.shape[1], sphere_figures, rig))
+        found["sphere"] = plain(measured_sphere(ball, wanted.sphere_mm)) | _of_noise(ball, scan, "form_mm")
+        found["sphere"]["uncertainty"] = {**spreads, "size_mm": spreads["diameter_mm"]}
+    if wanted.target is not None:
+        seen, ends = target_ends(scan.albedo, scan.xyz, wanted.target)
+        of_length = spread_of_length(seen, wanted.target, scan.xyz, rig).as_dict()
+        found["length"] = plain(length_between(ends, wanted.target, wanted.length_mm))
+        found["length"]["uncertainty"] = {"error_mm": of_length, "measured_mm": of_length}
+    if found:
+        found["coverage_factor"], found["unknown"] = COVERAGE_FACTOR, why
+    if wanted.edge is not None:
+        x, y, width, height = wanted.edge
+        found["edge"] = plain(edge_width(scan.xyz[y : y + height, x : x + width]))
+    if wanted.marks is not None:
+        found["marks"] = measured_marks(wanted.marks, scan.albedo, scan.xyz)
+    return found
+
+
+def rig_of(folder: Path, scan: Scan, given: Path | None = None) -> tuple[Rig | None, str | None]:
+    """The scan's rig, and why the calibration's part is not known, in words; None where it is.
+
+    Raises:
+        CalibrationError: see `verified`.
+    """
+    calibration = load_calibration(given) if given is not None else _kept(folder, scan)
+    if calibration is None:
+        return None, "the scan's folder has no calibration of the name that its report has: --calibration FILE"
+    axis = calibration.phase_axis if scan.rows is not None and scan.columns is not None else None
+    rig = Rig(calibration, axis or ("y" if scan.rows is not None else "x"))
+    if not _made_by(rig, scan):
+        return None, f"the scan's points were not made by calibration {calibration.id or given}"
+    if calibration.extra.get("covariance") is None:
+        return rig, "the calibration has no covariance"
+    return rig, None
+
+
+def _kept(folder: Path, scan: Scan) -> Calibration | None:
+    """The calibration that the scan's capture names, in the scan's folder or around it."""
+    name = (scan.report.get("rig") or {}).get("calibration")
+    for place in (folder / "capture", folder.resolve().parent):
+        try:
+            path = Capture.open(place).calibration_path
+            found = None if path is None else load_calibration(path)
+        except ScannerError:
+            continue  # no capture, or another one: there is nothing to know of it
+        if found is not None and found.id == name:
+            return found
+    return None
+
+
+def _made_by(rig: Rig, scan: Scan) -> bool:
+    """Whether points are seen by the projector where their coordinates say."""
+    values, sigmas = (scan.rows, scan.sigma_rows) if rig.axis == "y" else (scan.columns, scan.sigma_columns)
+    if scan.xyz is None or values is None or scan.shape != rig.calibration.camera.size[::-1]:
+        return False
+    there = np.flatnonzero(scan.valid & np.isfinite(values))
+    if not there.size:
+        return False
+    at = there[np.linspace(0, there.size - 1, min(200, there.size)).astype(np.intp)]
+    points = scan.xyz.reshape(-1, 3)[at]
+    seen = rig.calibration.projector.project(rig.calibration.to_projector(points))[:, 1 if rig.axis == "y" else 0]
+    noise = 0.0 if sigmas is None else float(np.nanmedian(sigmas.reshape(-1)[at]))
+    return bool(np.median(np.abs(seen - values.reshape(-1)[at])) < SAME_PX + noise)
+
+
+def _of_noise(on: FeaturePoints, scan: Scan, name: str) -> dict[str, Any]:
+    """The figure of a perfect feature in this noise, where the scan has sigmas."""
+    if scan.sigma_z is None:
+        return {"noise_mm": None}
+    figures = board_figures if name == "flatness_mm" else sphere_figures
+    return {"noise_mm": noise_alone(on, scan.sigma_z, figures, round_=name == "form_mm")[name]}
+
+
+def _spreads(found: dict[str, Any]) -> dict[str, Any]:
+    return {name: spread.as_dict() for name, spread in found.items()}

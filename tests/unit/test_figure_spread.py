@@ -1,0 +1,166 @@
+"""How sure a verification's figures are: a baseline that scales everything, noise that scatters it, what is unknown."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from scanner.calibration import figure_spread
+from scanner.calibration.detection import Detection
+from scanner.calibration.figure_spread import Rig, noise_alone, spread_of_figures, spread_of_length
+from scanner.calibration.targets import parse_target
+from scanner.calibration.verification import FeaturePoints, board_figures, board_points, sphere_figures
+from scanner.capture import CaptureHeader
+from scanner.geometry import calibration_from_dict
+from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
+from scanner.scan import Scan
+from service.cli import main
+
+WIDTH, HEIGHT, RADIUS = 160, 120, 60.0
+BASELINE = 150.0
+SHARE = 1e-3
+"""1-sigma of the baseline: of all lengths, too"""
+NOISE_MM = 0.05
+
+
+def rig(**extra):
+    """A projector 150 mm above the camera; its covariance knows an error of the baseline alone."""
+    lens = {
+        "size": [WIDTH, HEIGHT],
+        "matrix": [[300, 0, 80], [0, 300, 60], [0, 0, 1]],
+        "distortion": [-0.05, 0, 0, 0, 0],
+    }
+    covariance = {"parameters": ["camera.k1", "translation.y"], "matrix": [[0.0, 0.0], [0.0, (SHARE * BASELINE) ** 2]]}
+    turn = cv2.Rodrigues(np.array([0.3, 0.0, 0.0]))[0]
+    return {
+        "format": "fringed-calibration", "version": 1, "id": "made up", "camera": lens, "projector": lens,
+        "rotation": turn.tolist(), "translation": [0, BASELINE, 0], "covariance": covariance, **extra,
+    }  # fmt: skip
+
+
+def rays():
+    calibration = calibration_from_dict(rig())
+    plane = calibration.camera.normalised(calibration.camera.pixel_grid())
+    return np.concatenate([plane, np.ones((HEIGHT, WIDTH, 1))], axis=-1)
+
+
+def ball(seed=0, noise=NOISE_MM):
+    """(H, W, 3) mm: a ball at 500 mm, nothing around it, noise along the rays; and the noise's sigma (H, W)."""
+    along, centre = rays(), np.array([0.0, 0.0, 500.0])
+    b, a = along @ centre, (along**2).sum(axis=-1)
+    root = b**2 - a * (centre @ centre - RADIUS**2)
+    z = (b - np.sqrt(np.where(root > 0.3 * RADIUS**2 * a, root, np.nan))) / a
+    z = z + np.random.default_rng(seed).normal(0, noise, z.shape)
+    return along * z[..., None], np.full(z.shape, noise, np.float32)
+
+
+def wall(seed=0):
+    """(H, W, 3) mm: a wall at 500 mm."""
+    z = 500 + np.random.default_rng(seed).normal(0, NOISE_MM, (HEIGHT, WIDTH))
+    return rays() * z[..., None]
+
+
+@pytest.fixture(autouse=True)
+def _fewer_draws(monkeypatch):
+    monkeypatch.setattr(figure_spread, "DRAWS", 100)
+
+
+def test_a_baseline_too_long_makes_a_ball_too_large_and_no_less_round():
+    found = spread_of_figures(ball_alone(0), WIDTH, sphere_figures, Rig(calibration_from_dict(rig()), "y"))
+    assert found["diameter_mm"].calibration == pytest.approx(SHARE * 2 * RADIUS, rel=0.2)
+    assert found["form_mm"].calibration < 2 * SHARE * 6 * NOISE_MM
+    both = np.hypot(found["diameter_mm"].random, found["diameter_mm"].calibration)
+    assert found["diameter_mm"].expanded == pytest.approx(2 * both)
+
+
+def ball_alone(seed):
+    """All points of a ball."""
+    flat = ball(seed)[0].reshape(-1, 3)
+    at = np.flatnonzero(np.isfinite(flat[:, 2]))
+    return FeaturePoints(flat[at], at, 1.0)
+
+
+def test_the_random_part_is_what_other_noise_makes_of_it():
+    clouds = [ball_alone(seed) for seed in range(12)]
+    stated = spread_of_figures(clouds[0], WIDTH, sphere_figures, None)
+    for name in ("diameter_mm", "form_mm"):
+        seen = np.std([sphere_figures(on.points)[name] for on in clouds], ddof=1)
+        # A deviation from twelve is good to 21 %, the stated one to 7 %: 2.5 sigma of both.
+        assert stated[name].random == pytest.approx(seen, rel=0.55)
+        assert stated[name].calibration is None
+        assert stated[name].expanded is None
+
+
+def test_form_and_flatness_of_what_is_perfect_are_those_of_its_noise():
+    on, sigma = ball_alone(0), ball()[1]
+    assert noise_alone(on, sigma, sphere_figures, round_=True)["form_mm"] == pytest.approx(
+        sphere_figures(on.points)["form_mm"], rel=0.1
+    )
+    on = board_points(wall())
+    assert noise_alone(on, sigma, board_figures, round_=False)["flatness_mm"] == pytest.approx(5.94 * NOISE_MM, rel=0.1)
+
+
+def test_length_of_a_target_is_as_sure_as_the_baseline_and_the_places_of_its_marks():
+    target = parse_target("chessboard:9x6:12")
+    calibration = calibration_from_dict(rig())
+    pixels = calibration.camera.project(target.points + np.array([0.0, 0.0, 500.0]))
+    off = np.random.default_rng(3).normal(0, 0.05, pixels.shape)
+    seen = Detection(np.arange(len(pixels)), pixels + off, np.full(len(pixels), 7.0))
+    found = spread_of_length(seen, target, wall().astype(np.float32), Rig(calibration, "y"))
+    assert found.calibration == pytest.approx(SHARE * 96, rel=0.02)
+    assert found.random == pytest.approx(np.sqrt(2) * 0.05 * 500 / 300, rel=0.3)
+    few = Detection(seen.ids[[0, 1, 8]], seen.points[[0, 1, 8]], seen.spacing[:3])
+    assert spread_of_length(few, target, wall().astype(np.float32), None).random is None
+
+
+def save(folder: Path, xyz, sigma, calibration: str) -> None:
+    """A scan of this rig, as `fringed scan` leaves it, with its capture's calibration beside it."""
+    made = calibration_from_dict(rig())
+    rows = made.projector.project(made.to_projector(xyz))[..., 1].astype(np.float32)
+    plain = np.full(rows.shape, 100, np.float32)
+    scan = Scan(
+        rows, None, plain * 1e-4, None, plain, plain, plain, np.zeros(rows.shape, np.uint8), xyz.astype(np.float32),
+        sigma, report={"format": "fringed-report", "version": 1, "rig": {"calibration": calibration}},
+    )  # fmt: skip
+    (folder / "capture").mkdir(parents=True)
+    np.savez(folder / "scan.npz", **scan.arrays())
+    (folder / "report.json").write_text(json.dumps(scan.report))
+    sequence = PatternSequence(
+        ProjectorSize(WIDTH, HEIGHT), McpPattern(bits=2, carriers=(20.0, 34.0), codes=(0, 1, 2, 3))
+    )
+    header = CaptureHeader(sequence, CameraFormat(WIDTH, HEIGHT, 8), frames=("0.png",), calibration="calibration.json")
+    (folder / "capture" / "capture.json").write_text(json.dumps(header.as_dict()))
+    (folder / "capture" / "calibration.json").write_text(json.dumps(rig()))
+
+
+def test_verify_takes_the_calibration_that_made_the_scan_and_no_other(tmp_path, capsys):
+    save(tmp_path / "a", *ball(), "made up")
+    ask = ["calibrate", "verify", str(tmp_path / "a"), "--sphere", "119.5", "--tolerance", "0.6"]
+    assert main([*ask, "--json"]) == 0
+    shown = capsys.readouterr()
+    found = json.loads(shown.out)["scans"][0]
+    assert found["unknown"] is None
+    unsure = found["sphere"]["uncertainty"]["size_mm"]
+    assert unsure["expanded"] == pytest.approx(2 * SHARE * 120, rel=0.2)
+    assert found["sphere"]["size_mm"] == pytest.approx(0.5, abs=0.03)
+    assert "with its expanded uncertainty (k = 2), 0.7" in shown.err
+    assert shown.err.rstrip().endswith("it is not")
+    assert main(ask) == 0
+    assert "+- 0.2" in capsys.readouterr().out
+    save(tmp_path / "b", *ball(), "another")
+    without, other = tmp_path / "without.json", tmp_path / "other.json"
+    without.write_text(json.dumps(rig(covariance=None)))
+    other.write_text(json.dumps(rig(translation=[0, 140, 0])))
+    for options, why in (
+        ([], "no calibration of the name that its report has"),
+        (["--calibration", str(without)], "the calibration has no covariance"),
+        (["--calibration", str(other)], "were not made by calibration made up"),
+    ):
+        assert main(["calibrate", "verify", str(tmp_path / "b"), "--sphere", "119.5", *options]) == 0
+        said = capsys.readouterr().out
+        assert "+- unknown" in said
+        assert why in said
