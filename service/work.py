@@ -57,7 +57,7 @@ class Work:
     def serve(self, jobs: queue.SimpleQueue[Job | None]) -> None:
         """Work until None comes."""
         if self._decode:
-            _warm_up()
+            _warm_up(self._ending)
         try:
             self._serve(jobs)
         finally:
@@ -131,10 +131,15 @@ class Work:
             raise _Cancelled
 
 
-def _warm_up() -> None:
-    """Load decoder and kernels while the devices open: the first scan should not wait for imports and caches."""
+def _warm_up(ending: threading.Event) -> None:
+    """Load decoder and kernels while the devices open: the first scan should not wait for imports and caches.
+
+    It stops where the worker ends meanwhile: a thread that still is in LLVM when Python takes itself down aborts it.
+    """
     began = time.perf_counter()
     for name in modules_with_kernels():
+        if ending.is_set():
+            return
         if name.startswith("scanner."):
             try:
                 importlib.import_module(name).warm_up()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from threading import Event
 
 import pytest
 import zmq
@@ -36,10 +37,10 @@ def test_nothing_waits_for_a_daemon_that_is_gone(tmp_path: Path, monkeypatch: py
     assert isinstance(first, Ready)
 
 
-def test_one_decoder_that_cannot_be_made_ready_does_not_stop_the_others(
+def test_decoders_are_made_ready_without_the_broken_one_and_no_more_once_the_worker_ends(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    ready: list[str] = []
+    ready, ending = list[str](), Event()
 
     class Module:
         def __init__(self, name: str) -> None:
@@ -52,6 +53,9 @@ def test_one_decoder_that_cannot_be_made_ready_does_not_stop_the_others(
 
     monkeypatch.setattr(work, "modules_with_kernels", lambda: ["scanner.broken", "scanner.sound"])
     monkeypatch.setattr("importlib.import_module", Module)
-    work._warm_up()
+    work._warm_up(ending)
     assert ready == ["scanner.sound"]
     assert "scanner.broken could not be made ready" in caplog.text
+    ending.set()
+    work._warm_up(ending)
+    assert ready == ["scanner.sound"]
