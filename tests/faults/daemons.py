@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from scanner.client import Client
 from service.config import load_rig
 
 RIG = "simulated:quick/board"
@@ -55,6 +56,12 @@ def children(daemon_pid: int, module: str = "") -> list[int]:
             if module.encode() in command and int(stat[1]) == daemon_pid and stat[0] != "Z":
                 found.append(int(folder.name))
     return found
+
+
+def settle(endpoint: str) -> None:
+    """Wait until worker and devices are there, so that no process appears within a test."""
+    with Client(endpoint) as waiting:
+        wait_for(lambda: (status := waiting.status())["workers"] and status["devices"])
 
 
 def wait_for(true: Callable[[], Any], timeout_s: float = 30.0) -> Any:

@@ -36,22 +36,20 @@ def wait_for_event(client: Client, job: str, kind: str) -> None:
 # --- workers ------------------------------------------------------------------------------------------------------
 
 
-def test_a_worker_killed_in_mid_scan_is_replaced(daemon: Callable[..., RunningDaemon]) -> None:
+def test_a_killed_worker_is_replaced_and_a_capture_that_kills_three_is_given_up_and_named(
+    daemon: Callable[..., RunningDaemon], tmp_path: Path
+) -> None:
     running = daemon()
+    killed: set[int] = set()
     with Client(running.endpoint) as client:
+        # Once, in mid-scan: another worker takes the scan over.
         job = client.start_scan("pmp")
         (seat,) = wait_for(lambda: [w for w in client.status()["workers"] if w["job"] == job])
         os.kill(seat["pid"], signal.SIGKILL)
         assert client.wait(job)["state"] == "done"
         assert client.status()["workers"][0]["pid"] != seat["pid"]
 
-
-def test_a_capture_that_kills_its_worker_three_times_is_given_up_and_named(
-    daemon: Callable[..., RunningDaemon], tmp_path: Path
-) -> None:
-    running = daemon()
-    killed: set[int] = set()
-    with Client(running.endpoint) as client:
+        # Every worker that takes the capture.
         job = client.start_scan("pmp")
         deadline = time.monotonic() + 60
         while (status := client.call("scan.status", id=job))["state"] not in ("failed", "done"):
@@ -76,7 +74,7 @@ def test_a_capture_that_kills_its_worker_three_times_is_given_up_and_named(
 
 
 def test_daemon_killed_while_it_acquires(daemon: Callable[..., RunningDaemon], tmp_path: Path) -> None:
-    first, job_id = daemon(), str(uuid.uuid4())
+    first, job_id = daemon(workers=0), str(uuid.uuid4())
     with Client(first.endpoint) as client:
         client.start_scan("pmp", job_id=job_id)
         wait_for_event(client, job_id, "frame")
@@ -107,12 +105,12 @@ def test_daemon_killed_between_scan_and_decode(daemon: Callable[..., RunningDaem
 
 
 def test_daemon_killed_with_a_scan_in_the_queue(daemon: Callable[..., RunningDaemon]) -> None:
-    first = daemon()
+    first = daemon(workers=0)
     with Client(first.endpoint) as client:
         client.start_scan("pmp")
         waiting = client.start_scan("mcp")
         first.kill()
-    second = daemon()
+    second = daemon(workers=0)
     with Client(second.endpoint) as client:
         outcome = client.wait(waiting)
         assert (outcome["state"], outcome["reason"]) == ("failed", "daemon_restarted")
@@ -153,11 +151,11 @@ def test_two_daemons_on_one_state_are_refused(daemon: Callable[..., RunningDaemo
     assert "another daemon" in second.stderr
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(("number", "workers"), [(signal.SIGTERM, 1), (signal.SIGHUP, 0)])
 def test_a_signal_ends_a_daemon_in_order(
-    number: signal.Signals, daemon: Callable[..., RunningDaemon], tmp_path: Path
+    number: signal.Signals, workers: int, daemon: Callable[..., RunningDaemon], tmp_path: Path
 ) -> None:
-    running = daemon()
+    running = daemon(workers=workers)
     with Client(running.endpoint) as client:
         job = client.start_scan("pmp")
         wait_for_event(client, job, "frame")
@@ -192,8 +190,8 @@ async def daemon_here(state: Path, **options: Any) -> AsyncIterator[tuple[AsyncC
         await serving
 
 
-async def test_a_disk_that_fills_in_mid_run_fails_the_scan_and_not_the_daemon(tmp_path: Path) -> None:
-    async with daemon_here(tmp_path) as (client, devices):
+async def test_a_disk_that_fills_and_devices_that_die_or_hang_end_the_scan_and_not_the_daemon(tmp_path: Path) -> None:
+    async with daemon_here(tmp_path, devices_silence_s=1.0) as (client, devices):
         job = await client.start_scan("pmp", repeat=3)
         async for event in client.events(job):
             if event.kind == "frame":
@@ -207,25 +205,18 @@ async def test_a_disk_that_fills_in_mid_run_fails_the_scan_and_not_the_daemon(tm
         resource.prlimit(devices(), resource.RLIMIT_FSIZE, before)
         assert (await client.scan("mcp")).xyz is not None
 
-
-@pytest.mark.parametrize(
-    ("blow", "says"), [(signal.SIGKILL, "devices process died"), (signal.SIGSTOP, "said nothing for 1 s")]
-)
-async def test_devices_that_die_or_hang_end_the_scan_and_come_back(
-    tmp_path: Path, blow: signal.Signals, says: str
-) -> None:
-    async with daemon_here(tmp_path, devices_silence_s=1.0) as (client, devices):
-        job = await client.start_scan("pmp")
-        async for event in client.events(job):
-            if event.kind == "frame" and event.fields["captured"] < event.fields["total"]:
-                os.kill(devices(), blow)
-                break
-        outcome = await client.wait(job)
-        assert (outcome["state"], outcome["reason"]) == ("failed", "device_lost")
-        assert says in outcome["error"]["message"]
-        with pytest.raises(DeviceLost):
-            await client.fetch(job, tmp_path / "never")
-        assert (await client.scan("mcp")).xyz is not None
+        for blow, says in (signal.SIGKILL, "devices process died"), (signal.SIGSTOP, "said nothing for 1 s"):
+            job = await client.start_scan("pmp")
+            async for event in client.events(job):
+                if event.kind == "frame" and event.fields["captured"] < event.fields["total"]:
+                    os.kill(devices(), blow)
+                    break
+            outcome = await client.wait(job)
+            assert (outcome["state"], outcome["reason"]) == ("failed", "device_lost")
+            assert says in outcome["error"]["message"]
+            with pytest.raises(DeviceLost):
+                await client.fetch(job, tmp_path / "never")
+            assert (await client.scan("mcp")).xyz is not None  # they came back
 
 
 async def test_a_worker_that_hangs_is_replaced(tmp_path: Path) -> None:
@@ -237,24 +228,24 @@ async def test_a_worker_that_hangs_is_replaced(tmp_path: Path) -> None:
         assert (await client.wait(job))["state"] == "done"
 
 
-@pytest.mark.parametrize("method", ["mcp", "pmp"])
-async def test_a_frame_that_is_damaged_in_the_spool_is_missing(method: str, tmp_path: Path) -> None:
+async def test_a_frame_that_is_damaged_in_the_spool_is_missing(tmp_path: Path) -> None:
     async with daemon_here(tmp_path) as (client, _):
         while not (workers := (await client.status())["workers"]):
             await asyncio.sleep(0.05)
-        os.kill(workers[0]["pid"], signal.SIGSTOP)
-        job = await client.start_scan(method)
-        async for event in client.events(job):
-            if event.kind == "acquired":
-                # The last frame: of PMP a sentinel, which the fringes can do without.
-                frames = tmp_path / "spool" / job / "capture" / "frames.npy"
-                content = bytearray(frames.read_bytes())
-                content[-5000] ^= 1
-                frames.write_bytes(content)
-                os.kill(workers[0]["pid"], signal.SIGCONT)
-        outcome = await client.result(job)
-        if method == "mcp":
-            assert (outcome["state"], outcome["reason"]) == ("failed", "decode_failed")
-        else:
-            assert outcome["state"] == "done"
-            assert len(outcome["report"]["capture"]["missing"]) == 1
+        # The last frame: of MCP the only one, of PMP a sentinel, which the fringes can do without.
+        for method in ("mcp", "pmp"):
+            os.kill(workers[0]["pid"], signal.SIGSTOP)
+            job = await client.start_scan(method)
+            async for event in client.events(job):
+                if event.kind == "acquired":
+                    frames = tmp_path / "spool" / job / "capture" / "frames.npy"
+                    content = bytearray(frames.read_bytes())
+                    content[-5000] ^= 1
+                    frames.write_bytes(content)
+                    os.kill(workers[0]["pid"], signal.SIGCONT)
+            outcome = await client.result(job)
+            if method == "mcp":
+                assert (outcome["state"], outcome["reason"]) == ("failed", "decode_failed")
+            else:
+                assert outcome["state"] == "done"
+                assert len(outcome["report"]["capture"]["missing"]) == 1

@@ -7,18 +7,20 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
 
 from scanner.capture import Capture
 from scanner.errors import StorageError
 from scanner.scan import load_scan
 from service.cli import main
+from tests.faults.daemons import settle
 
 FRINGED = (sys.executable, "-c", "import sys; from service.cli import main; sys.exit(main())")
 SCAN_FILES = {"scan.npz", "cloud.ply", "preview.png", "report.json", "capture"}
@@ -51,7 +53,22 @@ def first_document(process: subprocess.Popen[str]) -> Any:
     return json.loads(lines + "}")
 
 
-def test_a_scan_from_nothing_to_files_and_again(tmp_path: Path) -> None:
+Here = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def here(capsys: pytest.CaptureFixture[str]) -> Here:
+    """Run a command in this process, where no more is asked of it: (status, standard output, standard error)."""
+
+    def runs(*words: Any) -> tuple[int, str, str]:
+        capsys.readouterr()
+        status = main([str(word) for word in words])
+        return status, *capsys.readouterr()
+
+    return runs
+
+
+def test_a_scan_from_nothing_to_files_and_again(tmp_path: Path, here: Here) -> None:
     folder = tmp_path / "out"
     words = ("scan", "--rig", "simulated:quick/board", "-o", folder)
     ran = fringed(*words, "--compare-truth", "--json")
@@ -65,19 +82,20 @@ def test_a_scan_from_nothing_to_files_and_again(tmp_path: Path) -> None:
     assert capture.header.state == "complete"
     assert capture.missing == ()
     # A second scan into the same folder is refused, or takes the first one's place without leaving anything of it.
-    refused = fringed(*words)
-    assert (refused.returncode, refused.stdout) == (1, "")
-    assert "--force" in refused.stderr
-    again = fringed(*words, "--force")
-    assert again.returncode == 0, again.stderr
-    assert "cloud.ply" in again.stdout
+    status, out, err = here(*words)
+    assert (status, out) == (1, "")
+    assert "--force" in err
+    status, out, err = here(*words, "--force")
+    assert status == 0, err
+    assert "cloud.ply" in out
     assert {path.name for path in folder.iterdir()} == SCAN_FILES
     assert Capture.open(folder / "capture").header.id != capture.header.id
     # What was captured decodes again, to the same rows.
-    assert fringed("decode", folder / "capture", "-o", tmp_path / "again").returncode == 0
-    audited = fringed("audit", folder / "capture", "-o", tmp_path / "timing.svg", "--json")
-    assert audited.returncode == 0, audited.stderr
-    assert json.loads(audited.stdout)["passed"]
+    assert here("decode", folder / "capture", "-o", tmp_path / "again")[0] == 0
+    np.testing.assert_array_equal(load_scan(tmp_path / "again").rows, load_scan(folder).rows)
+    status, out, err = here("audit", folder / "capture", "-o", tmp_path / "timing.svg", "--json")
+    assert status == 0, err
+    assert json.loads(out)["passed"]
     assert (tmp_path / "timing.svg").read_text().lstrip().startswith("<")
 
 
@@ -131,7 +149,7 @@ sys.exit(main(["status", "--connect", "ipc://{tmp_path}/control.ipc"]))
 
 @pytest.mark.parametrize(
     ("rig", "said"),
-    [("simulated:quick/nowhere", "nowhere"), ("simulated:quick/board?speed=3", "speed"), ("lost.toml", "lost.toml")],
+    [("simulated:quick/nowhere", "nowhere"), ("lost.toml", "lost.toml")],
 )
 def test_a_rig_that_is_not_there_is_named(rig: str, said: str, tmp_path: Path) -> None:
     ran = fringed("scan", "--rig", rig, "-o", tmp_path / "out", "--json")
@@ -141,7 +159,28 @@ def test_a_rig_that_is_not_there_is_named(rig: str, said: str, tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_disk_without_room_is_noticed_before_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+# --- with a daemon that runs --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Of `fringed daemon`, which says where it serves, and ends in order with nothing more to say."""
+    folder = tmp_path_factory.mktemp("d")
+    endpoint, words = f"ipc://{folder}/control.ipc", ("simulated:quick/board", "--state", folder / "state", "--json")
+    with running("daemon", *words, "--endpoint", endpoint) as daemon:
+        told = first_document(daemon)
+        assert (told["pid"], told["endpoints"]["control"]) == (daemon.pid, endpoint)
+        assert set(told) == {"endpoints", "pid", "rig"}
+        settle(endpoint)
+        yield endpoint
+        daemon.send_signal(signal.SIGTERM)
+        rest, _ = daemon.communicate(timeout=PATIENCE_S)
+    assert (daemon.returncode, rest) == (0, "")
+
+
+def test_a_disk_without_room_is_noticed_before_the_run(
+    endpoint: str, here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked: list[int] = []
 
     def full(folder: Path, needed: int) -> None:
@@ -149,44 +188,40 @@ def test_a_disk_without_room_is_noticed_before_the_run(tmp_path: Path, monkeypat
         raise StorageError(f"{folder} is full", hint="free some space")
 
     monkeypatch.setattr("scanner.storage.check_room", full)
-    assert main(["scan", "--rig", "simulated:quick/board", "-o", str(tmp_path / "out")]) == 1
+    assert here("scan", "--connect", endpoint, "-o", tmp_path / "out")[0] == 1
     assert asked[0] > 31 * 320 * 240
     assert list(tmp_path.iterdir()) == []
+    assert json.loads(here("status", "--connect", endpoint, "--json")[1])["scans"][-1]["state"] == "cancelled"
 
 
-def test_a_running_daemon_is_asked_for_scans(tmp_path: Path) -> None:
-    endpoint = f"ipc://{tmp_path}/control.ipc"
-    state = tmp_path / "state"
-    with running("daemon", "simulated:quick/board", "--endpoint", endpoint, "--state", state, "--json") as daemon:
-        told = first_document(daemon)
-        assert (told["pid"], told["endpoints"]["control"]) == (daemon.pid, endpoint)
-        assert set(told) == {"endpoints", "pid", "rig"}
-        with running("worker", "--connect", endpoint, "--json") as worker:
-            assert first_document(worker) == {"endpoint": endpoint, "pid": worker.pid}
-            worker.send_signal(signal.SIGINT)
-            rest, said = worker.communicate(timeout=PATIENCE_S)
-        assert (worker.returncode, rest) == (130, ""), said
-        assert "error: interrupted" in said
-        for method in ("mcp", "gray"):
-            ran = fringed("scan", "--connect", endpoint, "--method", method, "-o", tmp_path / method, "--json")
-            assert ran.returncode == 0, ran.stderr
-            assert json.loads(ran.stdout)["report"]["points"] > 10_000
-        scans = json.loads(fringed("status", "--connect", endpoint, "--json").stdout)["scans"]
-        assert [scan["state"] for scan in scans] == ["done", "done"]
-        assert fringed("status", "--connect", endpoint).returncode == 0
-        daemon.send_signal(signal.SIGTERM)
-        rest, _ = daemon.communicate(timeout=PATIENCE_S)
-    assert (daemon.returncode, rest) == (0, "")
+def test_a_worker_says_where_it_works_and_is_told_to_stop(endpoint: str) -> None:
+    with running("worker", "--connect", endpoint, "--json") as worker:
+        assert first_document(worker) == {"endpoint": endpoint, "pid": worker.pid}
+        worker.send_signal(signal.SIGINT)
+        rest, said = worker.communicate(timeout=PATIENCE_S)
+    assert (worker.returncode, rest) == (130, ""), said
+    assert "error: interrupted" in said
 
 
-def test_preview_writes_a_picture_and_tells_how_bright_it_is(tmp_path: Path) -> None:
+def test_a_running_daemon_is_asked_for_scans(endpoint: str, here: Here, tmp_path: Path) -> None:
+    before = json.loads(here("status", "--connect", endpoint, "--json")[1])["scans"]
+    for method in ("mcp", "gray"):
+        status, out, err = here("scan", "--connect", endpoint, "--method", method, "-o", tmp_path / method, "--json")
+        assert status == 0, err
+        assert json.loads(out)["report"]["points"] > 10_000
+    scans = json.loads(here("status", "--connect", endpoint, "--json")[1])["scans"]
+    assert [scan["state"] for scan in scans[len(before) :]] == ["done", "done"]
+    assert here("status", "--connect", endpoint)[0] == 0
+
+
+def test_preview_writes_a_picture_and_tells_how_bright_it_is(endpoint: str, here: Here, tmp_path: Path) -> None:
     file = tmp_path / "seen.png"
-    ran = fringed("preview", "--rig", "simulated:quick/board", "--seconds", "0.2", "-o", file, "--json")
-    assert ran.returncode == 0, ran.stderr
-    told = json.loads(ran.stdout)
+    status, out, err = here("preview", "--connect", endpoint, "--seconds", "0.2", "-o", file, "--json")
+    assert status == 0, err
+    told = json.loads(out)
     assert told["pictures"] > 0
     assert 0.2 < told["mean"] < told["bright"] < 1
     assert cv2.imread(str(file), cv2.IMREAD_UNCHANGED).shape == (240, 320)
-    assert "sharpness" in ran.stderr
-    refused = fringed("preview", "-o", tmp_path / "seen.gif")
-    assert (refused.returncode, "png or jpg" in refused.stderr) == (2, True)
+    assert "sharpness" in err
+    status, _, err = here("preview", "-o", tmp_path / "seen.gif")
+    assert (status, "png or jpg" in err) == (2, True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import stat
-import tempfile
 import time
 import uuid
 from collections.abc import Iterator
@@ -17,13 +16,12 @@ import pytest
 import zmq
 
 from scanner.client import AsyncClient, Client
-from scanner.errors import ConfigError, DeviceLost, StorageError, Unreachable
+from scanner.errors import ConfigError, StorageError
 from scanner.wire import MAX_REQUEST_BYTES, Event, Refused
 from scanner.wire_images import decode_preview
-from service.config import RigConfig, load_rig
+from service.config import load_rig
 from service.private import private_daemon
-
-RIG = "simulated:quick/board"
+from tests.faults.daemons import RIG, settle
 
 
 @pytest.fixture(scope="module")
@@ -31,13 +29,6 @@ def endpoint() -> Iterator[str]:
     with private_daemon(load_rig(RIG)) as found:
         settle(found)
         yield found
-
-
-def settle(endpoint: str) -> None:
-    """Wait until worker and devices are there, so that no process appears within a test."""
-    with Client(endpoint) as waiting:
-        while not ((status := waiting.status())["workers"] and status["devices"]):
-            time.sleep(0.05)
 
 
 @pytest.fixture
@@ -363,75 +354,3 @@ async def test_a_cancelled_task_cancels_its_scan(endpoint: str) -> None:
         with pytest.raises(asyncio.CancelledError):
             await task
         assert (await client.list_scans())[-1]["state"] == "cancelled"
-
-
-# --- no daemon, or one that refuses -------------------------------------------------------------------------------
-
-
-def test_nobody_there(tmp_path: Path) -> None:
-    with pytest.raises(Unreachable, match="does not exist") as caught:
-        Client(f"ipc://{tmp_path}/control.ipc")
-    assert "fringed daemon" in str(caught.value.hint)
-
-
-async def test_nobody_listens_any_more(tmp_path: Path) -> None:
-    import socket  # noqa: PLC0415
-
-    with socket.socket(socket.AF_UNIX) as left:
-        left.bind(str(tmp_path / "control.ipc"))
-    with pytest.raises(Unreachable, match="nobody listens"):
-        async with AsyncClient(f"ipc://{tmp_path}/control.ipc"):
-            pass
-
-
-def test_tcp_is_refused_in_words() -> None:
-    with pytest.raises(Refused, match="only ipc") as caught:
-        Client("tcp://127.0.0.1:5555")
-    assert "CURVE" in str(caught.value.hint)
-
-
-def limited(rig: RigConfig, limit_gb: float) -> RigConfig:
-    return rig.model_copy(update={"daemon": rig.daemon.model_copy(update={"spool_limit_gb": limit_gb, "workers": 0})})
-
-
-def test_a_scan_without_room_is_refused_before_anything_is_written() -> None:
-    with private_daemon(limited(load_rig(RIG), 1e-6)) as endpoint, Client(endpoint) as client:
-        with pytest.raises(StorageError, match="spool holds") as caught:
-            client.scan("mcp")
-        assert "spool_limit_gb" in str(caught.value.hint)
-        job = client.list_scans()[-1]
-        assert job["reason"] == "disk_full"
-        assert not (Path(endpoint.removeprefix("ipc://")).parent / "spool" / job["id"]).exists()
-
-
-def test_a_private_daemon_leaves_nothing(tmp_path: Path) -> None:
-    with private_daemon(load_rig(RIG)) as endpoint:
-        folder = Path(endpoint.removeprefix("ipc://")).parent
-        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    assert not folder.exists()
-
-
-def test_a_private_daemon_that_cannot_start_names_its_log(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = load_rig(RIG)
-    monkeypatch.setattr(RigConfig, "as_toml", lambda self: "nonsense = [")
-    with pytest.raises(Unreachable) as caught, private_daemon(rig):
-        pass
-    log = Path(str(caught.value.hint).rpartition(": ")[2])
-    assert "rig.toml" in log.read_text()
-    log.unlink()
-    assert log.parent == Path(tempfile.gettempdir())
-
-
-def test_a_private_daemon_has_a_worker_whatever_the_rig_file_says() -> None:
-    rig = load_rig(RIG)
-    alone = rig.model_copy(update={"daemon": rig.daemon.model_copy(update={"workers": 0})})
-    with private_daemon(alone) as endpoint, Client(endpoint) as client:
-        assert client.scan("mcp").xyz is not None
-
-
-def test_a_private_daemon_keeps_the_log_that_an_error_points_to() -> None:
-    with pytest.raises(DeviceLost) as caught, private_daemon(load_rig(RIG)):
-        raise DeviceLost("the devices process died", hint="look at the log for the cause")
-    log = Path(str(caught.value.hint).rpartition(": ")[2])
-    assert "serving ipc://" in log.read_text()
-    log.unlink()

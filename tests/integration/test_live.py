@@ -28,6 +28,7 @@ from scanner.wire import Refused
 from service.cli import main
 from service.config import load_rig
 from service.private import private_daemon
+from tests.faults.daemons import settle
 
 pytestmark = pytest.mark.alone
 
@@ -39,9 +40,7 @@ SHORT = {"exposure": 15_000.0}
 @pytest.fixture(scope="module")
 def endpoint() -> Iterator[str]:
     with private_daemon(load_rig(RIG)) as found:
-        with Client(found) as waiting:
-            while not ((status := waiting.status())["workers"] and status["devices"]):
-                time.sleep(0.05)
+        settle(found)
         yield found
 
 
