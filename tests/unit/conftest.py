@@ -1,9 +1,14 @@
-"""A small rig and scenes whose truth is a formula: what the tests of geometry, scans and pictures measure against."""
+"""A small rig and scenes whose truth is a formula: what the tests of geometry, scans and pictures measure against.
+
+And the command line, run in the test's own process.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +18,7 @@ from numpy.typing import NDArray
 from scanner.decode import Decoded, Reason
 from scanner.devices import Truth
 from scanner.geometry import Calibration, Lens
+from service import cli
 
 CAMERA = (320, 240)
 
@@ -96,3 +102,21 @@ def scene_with() -> Callable[..., SmallScene]:
 def ball() -> SmallScene:
     """Sphere and wall, projector above."""
     return scene_of(small_rig("y"), ball_before_wall)
+
+
+@pytest.fixture
+def run(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Callable[..., tuple[int, str, str]]:
+    """Run a command in `tmp_path`: (status, standard output, standard error)."""
+    monkeypatch.chdir(tmp_path)
+
+    def runs(*words: Any) -> tuple[int, str, str]:
+        capsys.readouterr()
+        status = cli.main([str(word) for word in words])
+        captured = capsys.readouterr()
+        assert "Traceback" not in captured.err
+        assert "error: unexpected" not in captured.err, captured.err
+        return status, captured.out, captured.err
+
+    return runs

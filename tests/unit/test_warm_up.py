@@ -6,8 +6,9 @@ import ast
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeGuard
 
 from scanner.kernel import CACHED
 
@@ -23,18 +24,33 @@ print(json.dumps([f"{module}.{name}" for module, name in kernels
 """
 
 
-def is_kernel(node: ast.AST) -> bool:
+def is_kernel(node: ast.AST) -> TypeGuard[ast.FunctionDef]:
     return isinstance(node, ast.FunctionDef) and any("kernel" in ast.unparse(d) for d in node.decorator_list)
 
 
-def called_from_python(node: ast.AST) -> Iterator[str]:
-    """Names that are called, or handed on, outside of kernels."""
-    if is_kernel(node):
-        return
-    if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
-        yield node.id
-    for child in ast.iter_child_nodes(node):
-        yield from called_from_python(child)
+@dataclass
+class Module:
+    """What one module has to do with kernels. Not its tree: hundreds of those keep the garbage collector busy."""
+
+    kernels: set[str]
+    called: set[str]
+    """names that are called, or handed on, outside of kernels"""
+    imported: set[tuple[str | None, str]]
+
+    @classmethod
+    def of(cls, source: str) -> Module:
+        tree = ast.parse(source)
+        found = cls({node.name for node in tree.body if is_kernel(node)}, set(), set())
+        rest = list[ast.AST](tree.body)
+        while rest:
+            node = rest.pop()
+            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
+                found.called.add(node.id)
+            elif isinstance(node, ast.ImportFrom):
+                found.imported |= {(node.module, alias.name) for alias in node.names}
+            elif not is_kernel(node):
+                rest.extend(ast.iter_child_nodes(node))
+        return found
 
 
 def module_of(path: Path) -> str:
@@ -42,20 +58,18 @@ def module_of(path: Path) -> str:
 
 
 def test_every_kernel_is_compiled_at_set_up() -> None:
-    trees = {
-        module_of(path): ast.parse(path.read_text())
+    modules = {
+        module_of(path): Module.of(path.read_text())
         for package in ("scanner", "drivers", "service")
         for path in (ROOT / package).rglob("*.py")
     }
-    kernels = {module: {n.name for n in tree.body if is_kernel(n)} for module, tree in trees.items()}
-    entered = set()
-    for module, tree in trees.items():
-        names = set(called_from_python(tree))
-        entered |= {(module, name) for name in kernels[module] & names}
-        imports = (n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module in kernels)
-        entered |= {
-            (str(n.module), a.name) for n in imports for a in n.names if a.name in kernels[str(n.module)] & names
-        }
+    kernels = {(name, kernel) for name, module in modules.items() for kernel in module.kernels}
+    entered = {
+        (name, kernel)
+        for here, module in modules.items()
+        for name, kernel in kernels & (module.imported | {(here, kernel) for kernel in module.kernels})
+        if kernel in module.called
+    }
     assert len(entered) > 30
     assert CACHED
     ran = subprocess.run(
