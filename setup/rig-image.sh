@@ -107,10 +107,7 @@ outdated() { if [ "$(cat "$state/built" 2>/dev/null)" != "$(image_stamp)" ]; the
 
 build() {
     local why
-    mkdir -p "$state"
-    exec 8>"$state/lock"
-    flock 8
-    [ -n "$(outdated)" ] || { exec 8>&-; return 0; }
+    [ -n "$(outdated)" ] || return 0
     why=$(obstacle)
     [ -z "$why" ] || cannot "$why"
     install_packages
@@ -124,5 +121,4 @@ build() {
     rm -rf "$work"
     work=
     image_stamp >"$state/built"
-    exec 8>&-
 }

@@ -7,10 +7,13 @@
 #     setup/rig.sh run CMD ARGS...      run a command in the guest (without systemd)
 #     setup/rig.sh steady CMD ARGS...   the same, where this machine cannot make the guest late: its clock counts instructions
 #     setup/rig.sh boot CMD ARGS...     the same, with systemd as the first process
-#     setup/rig.sh build                build the image only
+#     setup/rig.sh prepare              build what is missing, so that the next call need not; for scripts that have time to spare
 #     setup/rig.sh possible             exit 0 if the rig can run here; else say why not
 #     setup/rig.sh if-possible          the tests, or a line that says why they could not be run (to their end), and exit 0
 #     setup/rig.sh told                 a line that says whether the tests passed with these sources
+#
+# Where there are two processors and memory for two guests, the one whose clock counts instructions runs beside the other
+# two, in time that they leave over: it is the one that lateness does not concern, and it is told at the end.
 #
 # Output comes as it is made, and the exit status is the command's; 125 means that the guest itself failed, 124 that
 # something took longer than it may, 77 that packages cannot be had. RIG_TIMEOUT: seconds a guest may take once it is up,
@@ -50,14 +53,14 @@ bounded() {
 }
 
 # What was begun is ended and removed. What stops in the middle of the preparation is not the tests' word.
-work= run= reader= preparing=
+work= run= reader= preparing= beside= told_beside=
 clear_up() {
     local status=$?
-    for process in $child $reader; do
+    for process in $child $reader $beside; do
         kill "$process" 2>/dev/null || true
         wait "$process" 2>/dev/null || true
     done
-    [ -z "$work$run" ] || rm -rf "$work" "$run"
+    [ -z "$work$run$told_beside" ] || rm -rf "$work" "$run" "$told_beside"
     case $preparing$status in yes0 | yes77 | yes124 | yes125) ;; yes*) fail "the preparation stopped (see above)" ;; esac
     exit $status
 }
@@ -89,10 +92,12 @@ stage() {
     PREFIX=/usr/local DESTDIR=$state/stage WHEELS='' PIP_NO_DEPS=1 \
         bounded "staging the service" 300 setup/install-system.sh 2>"$state/stage.log" ||
         { cat "$state/stage.log" >&2; cannot "the service could not be staged (see above)"; }
-    # numba knows a source by its path, time and size: the same for the clone's own.
+    rm -rf "$site"/{pip,setuptools,pkg_resources,_distutils_hack,distutils-}* # half of all files; unpacking a file takes the guest 2 ms
+    # numba knows a source by its path, time and size: the same for the clone's own. Python's own compiled files too.
     (cd "$site" && find scanner -name '*.py') | while read -r source; do
         [ ! -e "$source" ] || touch -r "$source" "$site/$source"
     done
+    .venv/bin/python -m compileall -q "$site/scanner"
     PYTHONPATH=$site NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES='' NUMBA_CACHE_DIR=$state/kernels/staged \
         bounded "compiling kernels" 600 .venv/bin/python -P $box/compile_kernels.py >&2 || fail "the kernels do not compile"
     printf '%s' "$kernels" >"$state/kernels/of"
@@ -116,8 +121,12 @@ carry_kernels() {
 
 prepare() {
     preparing=yes
+    mkdir -p "$state"
+    exec 8>"$state/lock"
+    flock 8 # two calls at once: the second waits, then finds its work done
     build
     stage
+    exec 8>&-
     preparing=
     say "ready after $SECONDS s"
 }
@@ -201,22 +210,44 @@ phase() {
         steady) # no bound on single tests: by the guest's clock waiting for the disk may take minutes
             say "drivers in time, by a clock that counts instructions"
             boot steady "${pytest[@]}" --timeout=0 tests/rig/test_steady*.py ;;
-        systemd) say "the service, under systemd"; boot systemd "${pytest[@]}" tests/rig/test_installed_projector.py tests/rig/test_installed.py ;;
+        systemd) say "the service, under systemd"; boot systemd "${pytest[@]}" tests/rig/test_installed{_projector,,_life}.py ;;
     esac
 }
 
 tests() {
-    local status=0 sources name began
+    local sources name
     sources=$(everything)
     rm -f "$state/passed"
     prepare
-    for name in fast steady systemd; do
-        began=$SECONDS
-        phase $name || status=1 # whatever the command in the guest said
-        say "this took $((SECONDS - began)) s"
-        [ $status = 0 ] || return $status
-    done
+    begin_beside steady
+    for name in fast systemd; do timed $name; done
+    if [ -n "$beside" ]; then end_beside; else timed steady; fi
     printf '%s %s' "$sources" "$(date +%F\ %R)" >"$state/passed"
+}
+
+# timed PHASE: ends this script with 1, whatever the command in the guest said, if its tests did not pass.
+timed() {
+    local began=$SECONDS status=0
+    phase "$1" || status=1
+    say "this took $((SECONDS - began)) s"
+    [ $status = 0 ] || exit $status
+}
+
+# begin_beside PHASE: in time that nobody else wants, so that it may well take long to start. Its output is kept for
+# `end_beside`, which ends this script if its tests did not pass.
+begin_beside() {
+    [ "$(nproc)" -ge 2 ] && [ "$(free_memory_mb)" -ge $((2 * memory_mb)) ] || return 0
+    told_beside=$(mktemp "$state/told.XXXXXX")
+    within 3600 "the guests" # beside the others for as long as they may take
+    RIG_BUDGET=$bound RIG_BOOT=$bound RIG_TIMEOUT=$bound nice setup/rig.sh "phase $1" >"$told_beside" 2>&1 &
+    beside=$!
+}
+end_beside() {
+    local status=0
+    wait "$beside" || status=$?
+    beside=
+    cat "$told_beside"
+    [ $status = 0 ] || exit $status
 }
 
 # For a script that others wait for. What is not the tests' word (77: packages cannot be had; 124: too slow here; 125: the
@@ -250,7 +281,8 @@ told() {
 
 case ${1:-tests} in
     possible) why=$(obstacle); [ -z "$why" ] || { say "$why"; exit 1; } ;;
-    build) preparing=yes; build ;;
+    prepare) prepare ;;
+    "phase steady") timed steady ;;
     run) shift; prepare; boot fast "$@" ;;
     steady) shift; prepare; boot steady "$@" ;;
     boot) shift; prepare; boot systemd "$@" ;;

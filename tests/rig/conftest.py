@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from tests.rig.installed import Visitor
 
 MODE = os.environ.get("RIG_IN_A_BOX")
 """How the guest was booted: "fast" for the drivers, "steady" for drivers in time, "systemd" for the service; None: this
@@ -21,6 +26,16 @@ def installed() -> None:
     from tests.rig.installed import install  # noqa: PLC0415  (of the guest alone)
 
     install()
+
+
+@pytest.fixture(scope="session")
+def ada() -> Iterator[Visitor]:
+    """A member of the clients' group who has said hello to the service; one for all tests, as it starts slowly."""
+    from tests.rig.installed import MEMBER, Visitor  # noqa: PLC0415  (of the guest alone)
+
+    with Visitor(MEMBER) as visitor:
+        visitor.hear("hello")
+        yield visitor
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -11,6 +11,7 @@ import json
 import os
 import queue
 import shutil
+import stat
 import subprocess
 import threading
 import time
@@ -18,6 +19,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
+
+import numpy as np
 
 from tests.rig import virtio_card
 
@@ -72,6 +75,10 @@ latency_us = [0, 17000]
 settle_us = 0
 """
 """Nobody's camera sees that display: scans begin, and come to no good end"""
+
+SHORT = {"method": "pmp", "pattern": {"frequencies": [1, 8], "shifts": [4, 4]}}
+LIVE = {"exposure": 4000.0, "content": "rows"}
+"""Parameters of a scan and of a live run"""
 
 KERNELS = """[Service]
 Environment=NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1
@@ -219,6 +226,35 @@ class Visitor:
         for line in self._process.stdout:
             self._told.put(json.loads(line))
         self._told.put({"kind": "gone"})
+
+
+def rows_of(folder: str) -> np.ndarray:
+    """Of the scan in this folder."""
+    with np.load(Path(folder) / "scan.npz") as content:
+        return np.asarray(content["rows"])
+
+
+def check_opens(user: str, path: Path, opens: bool) -> None:
+    """Whether this user can connect to this socket."""
+    connect = f"import socket; socket.socket(socket.AF_UNIX).connect({str(path)!r})"
+    tried = run("/usr/bin/python3", "-I", "-S", "-c", connect, user=user)
+    assert (tried.returncode == 0) == opens, tried.stderr
+    assert opens or "PermissionError" in tried.stderr
+
+
+def check_watched(visitor: Visitor, kind: str, params: dict[str, Any]) -> None:
+    """A preview or a live run has a socket, for members of the clients' group, while somebody watches."""
+    visitor.ask("until", True)
+    visitor.hear("until")
+    visitor.ask(kind, params)
+    visitor.hear(kind, seconds=240)
+    path = RUN / f"{kind}.ipc"
+    assert (path.owner(), path.group(), stat.S_IMODE(path.stat().st_mode)) == ("fringed", "fringed-clients", 0o660)
+    check_opens(MEMBER, path, True)
+    check_opens(STRANGER, path, False)
+    visitor.ask("leave", {})
+    visitor.hear("left")
+    wait_for(lambda: not path.exists(), 10)
 
 
 @contextmanager
