@@ -17,7 +17,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -59,6 +59,10 @@ if TYPE_CHECKING:
 DEFAULT_STATE = Path("/var/lib/fringed")
 LOCK_S = 5.0
 """How long the children of a daemon that was killed may take to end."""
+
+SUBSCRIPTION_S, SUBSCRIPTIONS_HELD = 0.001, 16
+"""Pause after subscriptions to events, of which the daemon has no use, and how many ZeroMQ holds of one subscriber: one
+that makes them without end waits, and not the daemon."""
 
 OnReady = Callable[[Mapping[str, str]], None]
 """Takes the endpoints by name"""
@@ -126,7 +130,8 @@ class Daemon:
     ) -> None:
         held = {"high_water": ANSWERS_HELD, "received": CALLS_HELD, "longest": MAX_SENT_BYTES}
         self._control = bound(context, zmq.ROUTER, self._endpoints.control, **held)
-        self._events = bound(context, zmq.XPUB, self._endpoints.events, longest=MAX_SUBSCRIPTION_BYTES)
+        listened = {"received": SUBSCRIPTIONS_HELD, "longest": MAX_SUBSCRIPTION_BYTES}
+        self._events = bound(context, zmq.XPUB, self._endpoints.events, **listened)
         router = bound(context, zmq.ROUTER, self._endpoints.worker)
         keep_from_clients(self._endpoints.worker)
         rig = self._config.model_dump(mode="json")
@@ -140,10 +145,7 @@ class Daemon:
         )
         callers = Callers(self._control, Calls(control), MAX_REQUEST_BYTES)
         listening = (self._endpoints.control, self._endpoints.events, self._endpoints.worker)
-        admission = Admission(dict(zip(listening, (self._control, self._events, router), strict=True)))
-        serving = [
-            asyncio.create_task(work) for work in (callers.serve(), self._drain_subscriptions(), admission.watch())
-        ]
+        serving = [asyncio.create_task(work) for work in (callers.serve(), self._drain_subscriptions())]
         workers.start(self._config.daemon.workers)
         opening = asyncio.create_task(_open_early(devices))
         loading = asyncio.create_task(asyncio.to_thread(import_module, "service.door"))  # before the first scan waits
@@ -153,10 +155,12 @@ class Daemon:
         if ready is not None:
             ready.set()
         _log.info("serving %s", self._endpoints.control)
+        admission = Admission(dict(zip(listening, (self._control, self._events, router), strict=True)))
         try:
             await self._stopped.wait()
         finally:
             _log.info("ending")
+            admission.close()
             self._notifier.ending()
             await live.close()
             await pipeline.close()
@@ -175,8 +179,13 @@ class Daemon:
         send_now(self._events, [data])
 
     async def _drain_subscriptions(self) -> None:
+        plain: zmq.Socket[bytes] = zmq.Socket.shadow(self._events.underlying)
         while True:
             await self._events.recv()
+            with suppress(zmq.Again):
+                for _ in range(1000):
+                    plain.recv(zmq.DONTWAIT)
+            await asyncio.sleep(SUBSCRIPTION_S)
 
 
 async def _open_early(devices: DevicesLink) -> None:

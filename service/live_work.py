@@ -26,9 +26,9 @@ from scanner.durations import Durations
 from scanner.endpoints import ipc_path
 from scanner.errors import DecodeError, ProtocolError, ScannerError
 from scanner.stream import FromWorker, LiveBegin, LiveCounts, LiveFrame
-from scanner.wire import MAX_MESSAGE_BYTES
 from scanner.wire_images import LiveHeader, encode_image
-from service.sockets import remove_sockets
+from service.descriptors import Admission
+from service.sockets import MAX_SUBSCRIPTION_BYTES, remove_sockets
 
 if TYPE_CHECKING:
     from scanner.reconstruct_live import LiveReconstruction, LiveResult
@@ -231,7 +231,7 @@ class _Publisher:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.PUB)
         # Each reader's queue holds the newest result alone, and nobody is ever waited for.
-        for option, value in ((zmq.LINGER, 0), (zmq.CONFLATE, 1), (zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)):
+        for option, value in ((zmq.LINGER, 0), (zmq.CONFLATE, 1), (zmq.MAXMSGSIZE, MAX_SUBSCRIPTION_BYTES)):
             self._socket.setsockopt(option, value)
         ipc_path(endpoint)
         before = os.umask(0o117)
@@ -242,6 +242,7 @@ class _Publisher:
             raise ProtocolError(f"cannot open the live socket {endpoint}: {error.strerror}") from error
         finally:
             os.umask(before)
+        self._admission = Admission({endpoint: self._socket})
 
     def publish(self, ticket: int, result: _Result | None) -> list[tuple[_Result, int]]:
         """Publish in order of tickets; what went out now, and when, ns."""
@@ -259,6 +260,7 @@ class _Publisher:
         return out
 
     def close(self) -> None:
+        self._admission.close()
         self._context.destroy(linger=0)
         remove_sockets([self._endpoint])
 

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from scanner.clock import Clock
 from scanner.devices import CameraCapabilities, CameraSettings, Image, TriggerMode
 from scanner.sequencer import Rig
-from scanner.wire import MAX_MESSAGE_BYTES
 from scanner.wire_images import PreviewHeader, encode_image
+from service.descriptors import Admission
 from service.pipe import Preview
-from service.sockets import remove_sockets
+from service.sockets import MAX_SUBSCRIPTION_BYTES, remove_sockets
 
 POP_NS = 500_000_000
 BRIGHT, DARK, GOOD = 0.97, 0.3, 0.7
@@ -36,6 +36,9 @@ UNWATCHED_NS = 10_000_000_000
 for the preview may have been killed, and lamps do not last for ever."""
 MOST_TRIES = 6
 """Pictures that may pass until the exposure suits the scene, or cannot: three at 4 times more cover a factor of 64"""
+
+SAID_MOST = 1000
+"""Subscriptions heard before a picture: somebody may make them without end"""
 
 LONGEST_NS = 200_000_000
 """Exposure that a preview goes to by itself: five pictures a second, also of a dark view."""
@@ -67,12 +70,13 @@ class Previewer:
         """pictures of the light, of which none is shown before the exposure suits it or MOST_TRIES are over"""
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.SNDHWM, 2)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_SUBSCRIPTION_BYTES)
         before = os.umask(0o117)
         try:
             self._socket.bind(wanted.endpoint)
         finally:
             os.umask(before)
+        self._admission = Admission({wanted.endpoint: self._socket})
 
     def is_of(self, wanted: Preview, rig: Rig) -> bool:
         """Whether this is the preview that is wanted; of devices that were opened anew it is none."""
@@ -131,7 +135,7 @@ class Previewer:
     def _is_watched(self) -> bool:
         """Whether somebody has subscribed, or had of late; when they are gone the light is put out."""
         with suppress(zmq.Again):
-            while True:  # XPUB: 1 or 0, and what was subscribed to first or is not any more by the last
+            for _ in range(SAID_MOST):  # XPUB: 1 or 0, and what was subscribed to first or is not any more by the last
                 said = self._socket.recv(zmq.DONTWAIT)
                 (self._topics.add if said[:1] == b"\x01" else self._topics.discard)(said[1:])
         now = self._clock.now_ns()
@@ -163,6 +167,7 @@ class Previewer:
     def close(self) -> None:
         """End the preview."""
         self.rest()
+        self._admission.close()
         self._context.destroy(linger=0)
         remove_sockets([self._wanted.endpoint])
 

@@ -19,12 +19,13 @@ from scanner.endpoints import ipc_path
 from scanner.errors import ConfigError, StorageError
 from scanner.storage import storage_errors
 from scanner.wire import LARGE_BYTES, MAX_MESSAGE_BYTES, WELCOME
+from service.descriptors import aside
 
 HIGH_WATER = 10_000
 """Messages that wait for one peer; more are refused (ROUTER) or dropped (events), never waited for."""
 
 
-MAX_SUBSCRIPTION_BYTES = 512
+MAX_SUBSCRIPTION_BYTES = 256
 """What a subscriber sends: its greeting, and which messages it wants. ZeroMQ keeps 40 bytes for each of these bytes."""
 
 
@@ -129,12 +130,13 @@ def refuse_taken(endpoints: Iterable[str]) -> None:
 
 
 def remove_sockets(endpoints: Iterable[str]) -> None:
-    """Delete the sockets that libzmq leaves; what is no socket is not ours."""
+    """Delete the sockets that libzmq leaves, also set aside; what is no socket is not ours."""
     for endpoint in endpoints:
         path = Path(ipc_path(endpoint))
-        with suppress(FileNotFoundError):
-            if stat.S_ISSOCK(path.lstat().st_mode):
-                path.unlink()
+        for there in (path, aside(path)):
+            with suppress(FileNotFoundError):
+                if stat.S_ISSOCK(there.lstat().st_mode):
+                    there.unlink()
 
 
 def send_now(to: zmq.asyncio.Socket, parts: Sequence[bytes]) -> bool:
