@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from service.logs import visible
+
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
@@ -54,6 +56,7 @@ class ProgressLines:
 
     def note(self, text: str) -> None:
         """A line that stays: something a reader will want to know later."""
+        text = visible(text)
         if self._progress is not None:
             self._progress.console.print(text, markup=False, highlight=False)
         else:
@@ -105,9 +108,9 @@ def status_line() -> Iterator[Callable[[str], None]]:
     def write(words: str) -> None:
         if terminal:
             width = shutil.get_terminal_size().columns
-            print(f"\r\x1b[K{words[: width - 1]}", end="", file=sys.stderr, flush=True)
+            print(f"\r\x1b[K{visible(words)[: width - 1]}", end="", file=sys.stderr, flush=True)
         else:
-            print(words, file=sys.stderr, flush=True)
+            print(visible(words), file=sys.stderr, flush=True)
 
     try:
         yield write
@@ -118,7 +121,7 @@ def status_line() -> Iterator[Callable[[str], None]]:
 
 def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """A table with a heading on standard output; plain columns where that is no terminal."""
-    cells = [[str(cell) for cell in row] for row in rows]
+    cells = [[visible(str(cell)) for cell in row] for row in rows]
     if not sys.stdout.isatty():
         widths = [max(map(len, column)) for column in zip(header, *cells, strict=True)]
         for row in (header, *cells):
@@ -138,6 +141,7 @@ def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[Any]]
 
 def print_facts(title: str, facts: Sequence[tuple[str, Any]]) -> None:
     """Pairs of name and value, one a line, on standard output."""
+    facts = [(name, visible(str(value))) for name, value in facts]
     if not sys.stdout.isatty():
         width = max((len(name) for name, _ in facts), default=0)
         for name, value in facts:
@@ -151,7 +155,7 @@ def print_facts(title: str, facts: Sequence[tuple[str, Any]]) -> None:
     table.add_column(style="cyan")
     table.add_column(overflow="fold")
     for name, value in facts:
-        table.add_row(escape(name), escape(str(value)))
+        table.add_row(escape(name), escape(value))
     Console().print(table)
 
 
@@ -173,16 +177,16 @@ def begin_output() -> None:
 def print_json(content: Any) -> None:
     """The one JSON document on standard output. Numbers that JSON has no form for (NaN, infinity) become null."""
     _output.document = True
-    print(json.dumps(_finite(content), indent=1, ensure_ascii=False, default=str), flush=True)
+    print(visible(json.dumps(_finite(content), indent=1, ensure_ascii=False, default=str)), flush=True)
 
 
 def print_error(message: str, hint: str | None = None, *, label: str = "error") -> None:
     """An error (or a warning), and what to do about it, on standard error."""
     colour = sys.stderr.isatty() and "NO_COLOR" not in os.environ
     red, faint, plain = ("\x1b[31m", "\x1b[2m", "\x1b[0m") if colour else ("", "", "")
-    print(f"{red}{label}:{plain} {message}", file=sys.stderr)
+    print(f"{red}{label}:{plain} {visible(message)}", file=sys.stderr)
     if hint:
-        print(f"{faint}hint:{plain} {hint}", file=sys.stderr, flush=True)
+        print(f"{faint}hint:{plain} {visible(hint)}", file=sys.stderr, flush=True)
 
 
 def print_failure(content: Any) -> None:

@@ -26,6 +26,9 @@ from scanner.errors import ConfigError
 
 DEFAULT_SCENE = "bust"
 
+MOST_PAIRS = 200
+"""Options in a device string: more than there are, and few enough to look at each"""
+
 Side = Literal["camera", "projector", "trigger"]
 _S = TypeVar("_S")
 
@@ -196,7 +199,8 @@ def setting_problems(device: str, options: Mapping[str, Any], side: Side) -> lis
     """All that `read_settings` would refuse, one by one: (option, error), option "" for the device string."""
     place, _, query = device.partition("?")
     parts: list[tuple[str, str, Mapping[str, Any]]] = [("", place, {})]
-    parts += [("", f"?{pair}", {}) for pair in query.split("&") if query]
+    pairs = query.split("&", MOST_PAIRS)
+    parts += [("", f"?{pair}", {}) for pair in pairs if query] if len(pairs) <= MOST_PAIRS else [("", device, {})]
     for key, value in options.items():
         of_table = key == "faults" and isinstance(value, Mapping)
         parts += [(key, "", {key: one}) for one in ([{name: value[name]} for name in value] if of_table else [value])]
@@ -236,6 +240,8 @@ def _split(device: str) -> tuple[str, str, list[tuple[str, str]]]:
     rig, scene = rig or rig_names()[0], scene or DEFAULT_SCENE
     _check_name("rig", rig, rig_names(), device)
     _check_name("scene", scene, scene_names(), device)
+    if tail.count("&") >= MOST_PAIRS:
+        raise ConfigError(f"a device string with more than {MOST_PAIRS} options", hint="each option once is enough")
     try:
         query = parse_qsl(tail, keep_blank_values=True, strict_parsing=bool(tail))
     except ValueError as error:

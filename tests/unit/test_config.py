@@ -6,12 +6,13 @@ import sys
 import tomllib
 from pathlib import Path
 from textwrap import dedent
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.simulated.options import read_settings, setting_problems
 from scanner.errors import ConfigError
 from service.config import RigConfig, check_rig, load_rig
 from service.rig_file_edit import set_values
@@ -325,3 +326,12 @@ def test_the_model_describes_every_field() -> None:
         return [name for name, field in model.model_fields.items() if not field.description]
 
     assert undescribed(RigConfig) == []
+
+
+@pytest.mark.parametrize("side", ["camera", "projector"])
+def test_a_device_string_with_endless_options_is_refused_at_once(side: Literal["camera", "projector"]) -> None:
+    device = "quick/board?" + "&".join(["a=1"] * 20_000)
+    for problem in [error for _, error in setting_problems(device, {}, side)]:
+        assert "more than 200" in problem.message
+    with pytest.raises(ConfigError, match="more than 200"):
+        read_settings(device, {}, side)

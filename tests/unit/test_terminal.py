@@ -1,12 +1,14 @@
 """What is drawn on a terminal, and what stands there instead in a log."""
 
 import json
+import logging
 import re
 import sys
 from pathlib import Path
 
 import pytest
 
+from service.logs import JsonFormatter
 from service.terminal import print_error, print_facts, print_json, print_table, progress_lines
 
 COLOURS = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
@@ -56,3 +58,21 @@ def test_a_terminal_gets_bars_and_tables(capsys: pytest.CaptureFixture[str], mon
 def test_json_holds_no_word_that_json_does_not_know(capsys: pytest.CaptureFixture[str]) -> None:
     print_json({"a": [float("nan"), float("inf"), 1.5], "p": Path("x"), 3: None})
     assert json.loads(capsys.readouterr().out) == {"a": [None, None, 1.5], "p": "x", "3": None}
+
+
+def test_what_others_wrote_moves_nothing_on_a_terminal_or_in_a_log(capsys: pytest.CaptureFixture[str]) -> None:
+    nasty = "caf\u00e9 \u202egnp.exe \x1b[2J\x9b1A \U000e0041\udc80"
+    seen = "caf\u00e9 \\u202egnp.exe \\u001b[2J\\u009b1A \\udb40\\udc41\\udc80"
+    print_error(nasty, nasty)
+    print_facts("title", [("name", nasty)])
+    said = capsys.readouterr()
+    assert said.err == f"error: {seen}\nhint: {seen}\n"
+    assert said.out == f"name  {seen}\n"
+    print_json({"name": nasty})
+    printed = capsys.readouterr().out
+    assert "\u202e" not in printed
+    assert json.loads(printed) == {"name": nasty}
+    record = logging.LogRecord("a", logging.INFO, "", 1, "%s", (nasty,), None)
+    line = JsonFormatter("daemon").format(record)
+    assert line.isprintable()
+    assert json.loads(line)["message"] == nasty
