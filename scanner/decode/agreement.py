@@ -56,6 +56,15 @@ class Remainder:
     """length of the mean vector, 1 = all pixels alike"""
     pixels: int
 
+    @property
+    def beyond_noise(self) -> float:
+        """Sigma over the whole image, cycles, from the mean vector's length (Mardia 1972, sec. 3.4), without noise's;
+        0 where too few pixels tell."""
+        if self.pixels < MIN_PIXELS:
+            return 0.0
+        spread2 = -2 * np.log(max(self.agreement, 1e-6)) / (2 * np.pi) ** 2
+        return float(np.sqrt(max(spread2 - self.expected_sigma**2, 0.0)))
+
 
 def agreement(
     ladder: Ladder, phases: NDArray[np.float32], cycles2: NDArray[np.float32], centre: float, floor_cycles: float
@@ -109,15 +118,9 @@ def doubtful_counts(axis: str, remainders: Sequence[Remainder]) -> tuple[str, ..
         "noise explains: where that reaches half a fringe the next one is counted. Light that surfaces throw at one "
         "another, in hollows, does this to wide fringes first: take frequencies without a low one (59, 64, 70), or "
         "gray+pmp"
-        for r, beyond in ((r, _beyond_noise(r)) for r in remainders if r.pixels >= MIN_PIXELS)
+        for r, beyond in ((r, r.beyond_noise) for r in remainders)
         if beyond > MOST_SYSTEMATIC and r.agreement >= MIN_AGREEMENT
     )
-
-
-def _beyond_noise(remainder: Remainder) -> float:
-    """Sigma over the whole image, cycles, from the mean vector's length (Mardia 1972, sec. 3.4), without noise's."""
-    spread2 = -2 * np.log(max(remainder.agreement, 1e-6)) / (2 * np.pi) ** 2
-    return float(np.sqrt(max(spread2 - remainder.expected_sigma**2, 0.0)))
 
 
 def noise_of_pairs(

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode import Coordinates, Decoded, Reason, neighbours
+from scanner.decode import Coordinates, Decoded, Reason, neighbours, one_surface
 from scanner.decode.agreement import disagreements, doubtful_counts
 from scanner.decode.frames import FrameCheck
 from scanner.decode.lone_set import require_fringes
@@ -200,6 +200,7 @@ class PmpDecoder:
                     "combinations": found.ladder.combinations.tolist(),
                     "remainders": [dict(vars(r)) for r in found.remainders],
                     "settled_by_neighbours": found.settled,
+                    "left_out_by_surface": found.off_surface,
                     "ripple": None if found.ripple is None else dict(vars(found.ripple)),
                 }
                 for axis, found in self._found.items()
@@ -217,3 +218,4 @@ def warm_up() -> None:
             decoder.add(position, sequence.image(position).astype(decoder.camera.dtype))
         decoder.finish()
     neighbours.warm_up()
+    one_surface.warm_up()

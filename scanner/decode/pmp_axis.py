@@ -20,6 +20,7 @@ from scanner.decode.agreement import MIN_PIXELS, Remainder
 from scanner.decode.cut_at_black import unmove_dark
 from scanner.decode.neighbours import settle
 from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel
+from scanner.decode.one_surface import doubt_axis, doubtful_steps
 from scanner.decode.pmp_frames import AxisFrames
 from scanner.decode.pmp_join import join_maps
 from scanner.decode.pmp_kernels import decode_pixels
@@ -160,6 +161,8 @@ class AxisFound:
     noise: NoiseModel
     remainders: list[Remainder]
     settled: int
+    off_surface: int
+    """pixels left out because their fringe is not the one of the surface around them"""
     ripple: Ripple | None
     """None with one frequency, which has nothing to differ from"""
     light: Light
@@ -230,8 +233,15 @@ def decode_axis(
         return counts
 
     counts = np.sum(in_strips(decode, pixels, threads), axis=0)
-    settled = 0
+    settled = off_surface = 0
     if counts[Reason.UNWRAP_RISK]:
+        if steps := doubtful_steps(remainders):
+            turns = (maps.position + np.float32(pattern.origin)) * np.float32(1 / along)
+            off_surface = doubt_axis(
+                frames, ladder, steps, t.clip(camera), camera.width, turns, maps.confidence, maps.reason
+            )
+            counts[Reason.VALUE] -= off_surface
+            counts[Reason.UNWRAP_RISK] += off_surface
         per_px = float(ladder.frequencies[-1]) / along
         settled = settle(maps.position, maps.sigma, maps.confidence, maps.reason, camera.width, per_px)
         counts[Reason.UNWRAP_RISK] -= settled
@@ -247,13 +257,11 @@ def decode_axis(
         if changes.any():
             confidence[torn == Reason.OUT_OF_STEP] = 0
             counts += changes
-    return AxisFound(maps, ladder, noise, remainders, settled, ripple, light, random_px, counts)
+    return AxisFound(maps, ladder, noise, remainders, settled, off_surface, ripple, light, random_px, counts)
 
 
 def _ripple(last: Remainder, weight: float, per_cycle: float, random_px: float) -> Ripple:
-    # Spread of angles from the length of their mean vector (Mardia 1972, 3.4): all of the image, not its better part.
-    spread2 = -2 * np.log(max(last.agreement, 1e-6)) / (2 * np.pi) ** 2
-    cycles = float(np.sqrt(max(spread2 - last.expected_sigma**2, 0.0) / weight))
+    cycles = last.beyond_noise / float(np.sqrt(weight))
     return Ripple(cycles, per_cycle * cycles, random_px)
 
 
