@@ -99,9 +99,8 @@ def test_lines_one_pixel_wide_are_no_fragments_however_they_are_broken(ball):
     sigma = np.full(depth.shape, 0.1, np.float32)
     for turned in (False, True):
         points = np.ascontiguousarray(xyz.transpose(1, 0, 2)) if turned else xyz
-        falls, removed = apply_filters(
-            points, sigma.T if turned else sigma, np.ones(points.shape[:2]), FilterSettings()
-        )
+        errors = np.ascontiguousarray(sigma.T) if turned else sigma
+        falls, removed = apply_filters(points, errors, np.ones(points.shape[:2]), FilterSettings())
         assert removed["fragments"] == 0
         assert not falls.any()
 

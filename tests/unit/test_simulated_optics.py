@@ -171,7 +171,9 @@ def test_noise_free_decoding_gives_the_truth(device: str) -> None:
     frames = bench.captured([sequence.image(i) for i in range(len(sequence))])
     truth = bench.camera.truth()
     expected = truth.rows if axis == "y" else truth.columns
-    error = (decoded(frames, pattern, sequence.projector.along(axis)) - expected)[truth.lit]
+    sample = np.s_[::3, ::3]  # a hundred and sixty thousand pixels, which tell of all of them
+    found = decoded([frame[sample] for frame in frames], pattern, sequence.projector.along(axis))
+    error = (found - expected[sample])[truth.lit[sample]]
     assert np.median(np.abs(error)) < 0.004
     assert abs(np.median(error)) < 0.001
     assert (np.abs(error) > 0.5).mean() < 1e-3
