@@ -153,7 +153,10 @@ def _processes() -> Iterator[str]:
             continue  # it ended while we looked
         state, parent = fields[0], fields[1]
         if not environment and not command and state not in "ZX":
-            yield f"{name} (in the middle of its start)"  # whose it is shows at the next look
+            # Whose it is shows at the next look. On a busy machine that may be late: what a stranger starts is its own.
+            # (Who lost its parent has process 1 for one, which is a stranger too.)
+            if parent == "1" or parent not in _strangers:
+                yield f"{name} (in the middle of its start)"
         elif MARK.encode() not in environment.split(b"\0") and parent != me:
             _strangers.add(name)
         elif state not in "ZX" and not any(name in command for name in LONG_LIVED):

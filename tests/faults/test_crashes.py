@@ -191,7 +191,7 @@ async def daemon_here(state: Path, **options: Any) -> AsyncIterator[tuple[AsyncC
 
 
 async def test_a_disk_that_fills_and_devices_that_die_or_hang_end_the_scan_and_not_the_daemon(tmp_path: Path) -> None:
-    async with daemon_here(tmp_path, devices_silence_s=1.0) as (client, devices):
+    async with daemon_here(tmp_path, devices_silence_s=3.0) as (client, devices):
         job = await client.start_scan("pmp", repeat=3)
         async for event in client.events(job):
             if event.kind == "frame":
@@ -205,7 +205,7 @@ async def test_a_disk_that_fills_and_devices_that_die_or_hang_end_the_scan_and_n
         resource.prlimit(devices(), resource.RLIMIT_FSIZE, before)
         assert (await client.scan("mcp")).xyz is not None
 
-        for blow, says in (signal.SIGKILL, "devices process died"), (signal.SIGSTOP, "said nothing for 1 s"):
+        for blow, says in (signal.SIGKILL, "devices process died"), (signal.SIGSTOP, "said nothing for 3 s"):
             job = await client.start_scan("pmp")
             async for event in client.events(job):
                 if event.kind == "frame" and event.fields["captured"] < event.fields["total"]:

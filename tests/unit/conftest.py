@@ -13,12 +13,17 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from hypothesis import settings
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Reason
 from scanner.devices import Truth
 from scanner.geometry import Calibration, Lens
 from service import cli
+
+# How long one example takes depends on who else computes: a slow one is no failure.
+settings.register_profile("shared processors", deadline=None)
+settings.load_profile("shared processors")
 
 CAMERA = (320, 240)
 
