@@ -190,6 +190,9 @@ def calibration_from_dict(content: Any, name: str = "calibration") -> Calibratio
         )
     if content.get("units", "mm") != "mm":
         raise CalibrationError(f"{name}: units are {content['units']!r:.80}, lengths must be in mm")
+    identity = "" if content.get("id") is None else content["id"]
+    if not isinstance(identity, str):
+        raise CalibrationError(f"{name}: id is {identity!r:.80}, it must be text", hint="leave it out, or quote it")
     _check_optional(content, name)
     camera, projector = (_lens(content.get(side), f"{name}: {side}") for side in ("camera", "projector"))
     odd = [*lens_warnings(camera, f"{name}: camera"), *lens_warnings(projector, f"{name}: projector")]
@@ -208,7 +211,7 @@ def calibration_from_dict(content: Any, name: str = "calibration") -> Calibratio
         )
     known = {"format", "version", "id", "camera", "projector", "rotation", "translation"}
     extra = {key: value for key, value in content.items() if key not in known}
-    rig = Calibration(camera, projector, rotation, translation, id=str(content.get("id", "")), extra=extra)
+    rig = Calibration(camera, projector, rotation, translation, id=identity, extra=extra)
     odd += [*rig_warnings(rig, name), *_covariance_warnings(content, name)]
     return replace(rig, warnings=tuple(odd))
 

@@ -96,6 +96,7 @@ def test_a_calibration_survives_its_file(rig_of, tmp_path):
         (lambda c: c.update(world=5), "world must be"),
         (lambda c: c.update(mcp_phase={"slope": 1.0}), r"mcp_phase\.intercept is missing"),
         (lambda c: c.update(response=[2.3]), "response must be"),
+        (lambda c: c.update(id=float("nan")), "id is nan, it must be text"),
     ],
 )
 def test_what_is_no_calibration_is_refused_and_named(rig_of, change, says):
