@@ -162,6 +162,10 @@ def _intrinsic(function: Callable[..., Any]) -> Any:
     return _extending.intrinsic(function)
 
 
+FLOATS, MASK, intrinsic = _FLOATS, _MASK, _intrinsic
+"""For more functions of lanes: `scanner.across_lanes`."""
+
+
 def _call(builder: Any, name: str, values: Any) -> Any:
     """One of LLVM's functions of floats to floats."""
     kind = ir.FunctionType(_FLOATS.vector, [_FLOATS.vector] * len(values))

@@ -10,6 +10,7 @@ import pytest
 from scanner.decode.mcp import carriers, decision, description, emissions, hmm, linking, stripes, tracks
 from scanner.decode.mcp.decoder import decode_image
 from scanner.decode.mcp.model import PatternModel
+from scanner.decode.mcp.signals import Signals
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern, ProjectorSize
 
@@ -40,9 +41,10 @@ def test_words_that_trade_places_are_told_from_a_few_wrong_ones():
     place = np.repeat(np.arange(OWN.stripes, dtype=np.int32), 20)
 
     def said(shown):
-        each = np.zeros((len(place), 16), np.float32)
+        each = np.zeros((len(place) + 9, 16), np.float32)
         each[np.arange(len(place)), shown] = 2 * description.CLEAR
-        return description.exchanged_words(each, place, word, OWN)
+        run_on = np.concatenate((place, OWN.stripes + np.arange(8), [-1])).astype(np.int32)  # past the last stripe
+        return description.exchanged_words(each, run_on, word, OWN)
 
     shown = word[place]
     assert said(shown) == ()
@@ -77,7 +79,7 @@ def test_carriers_of_one_set_are_not_taken_for_another_where_the_magnification_d
     start = np.arange(0, count + 1, len(rows), dtype=np.int32)
     at = np.tile(rows, len(columns)).astype(np.float32)
     peaks = stripes.Peaks(start, at, zero, zero, zero, zero, np.ones(count, np.uint8))
-    signals = carriers.Signals(light.astype(np.float32).ravel(), zero)
+    signals = Signals(light.astype(np.float32).ravel(), zero)
     found = carriers.search_carriers(signals, tracks.single(peaks, chains), PUBLISHED, 38 / 27, (1040, 1392))
     assert found.scale == pytest.approx(1.4, rel=0.02)
     assert found.drift_x == pytest.approx(0.1, abs=0.031)

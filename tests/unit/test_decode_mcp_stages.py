@@ -23,6 +23,7 @@ from scanner.decode.mcp import (
     tracks,
 )
 from scanner.decode.mcp.model import PatternModel
+from scanner.decode.mcp.signals import Signals
 from scanner.patterns import McpPattern, ProjectorSize
 
 PROJECTOR = ProjectorSize(1152, 864)
@@ -175,6 +176,28 @@ def test_forward_backward_is_the_sum_over_all_paths(seed):
     np.testing.assert_allclose(lost, none / everything, atol=3e-3)
 
 
+def test_forward_backward_of_more_states_than_a_vector_has_lanes():
+    random = np.random.default_rng(4)
+    start, states = np.array([0, 7, 7, 12], np.int32), 40
+    evidence, stray = random.normal(0, 1, (12, states)).astype(np.float32), random.normal(-2, 1, 12).astype(np.float32)
+    gap = random.integers(0, 2 * hmm.MAX_GAP, 12).astype(np.int32)
+    tables = hmm.transitions(states).astype(np.float64)
+    posterior, lost = hmm.smooth_columns(evidence, start, gap, hmm.transitions(states), stray)
+    likely, none = (1 - hmm.STRAY) * np.exp(evidence.astype(np.float64)), hmm.STRAY * np.exp(stray.astype(np.float64))
+    for first, last in ((0, 7), (7, 12)):
+        before = [np.full(states, 1 / states)]
+        for t in range(first, last):
+            moved = before[-1] if t == first else before[-1] @ tables[gap[t]]
+            before.append(moved * likely[t] + before[-1] * none[t])
+        after = np.ones(states)
+        for t in range(last - 1, first - 1, -1):
+            moved = before[t - first] if t == first else before[t - first] @ tables[gap[t]]
+            right, wrong = moved * likely[t] * after, (before[t - first] * none[t] * after).sum()
+            np.testing.assert_allclose(posterior[t], right / (right.sum() + wrong), atol=3e-3)
+            assert lost[t] == pytest.approx(wrong / (right.sum() + wrong), abs=3e-3)
+            after = tables[gap[t]] @ (likely[t] * after) + after * none[t]
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_viterbi_is_the_best_of_all_paths(seed):
     evidence, stray, gap, total = columns_case(seed)
@@ -228,10 +251,10 @@ def test_amplitudes_and_magnification_of_made_signals(length):
     flat = light.ravel()
     size = magnification.window_px(OWN, scale)
     if length >= 2 * size:
-        signals = carriers.Signals(flat, np.zeros(len(y), np.float32))
+        signals = Signals(flat, np.zeros(len(y), np.float32))
         search = carriers.search_carriers(signals, each, OWN, 1.38, shape)
         assert min(search.contrast) > 1.5
-        field = magnification.fit_field(flat, each, OWN, search, size, shape) * search.scale
+        field = magnification.fit_fields(flat, each, OWN, search, size, shape)[0] * search.scale
         np.testing.assert_allclose(field, own, rtol=0.006)
     seen = emissions.measure(flat, each, np.float32(own / scale), OWN, scale, size)
     expected = OWN.ratio[2 * (number % 16)] * (0.9, 0.8, 0.7, 0.6)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scanner.decode.mcp import carriers, linking, stripes, tracks
+from scanner.decode.mcp import linking, signals, stripes, tracks
 
 PITCH, LONG = 40.0, 17
 
@@ -98,7 +98,7 @@ def test_light_without_print_is_what_the_formula_says():
     weights = np.exp(-0.5 * (np.arange(-14, 15) / 5.6) ** 2).astype(np.float32)
     light = np.concatenate((total, total))
     joined, ambient = np.array([False, True]), np.float32([0.3, 0.3])
-    carriers._flatten(light, np.array([0, 100, 200], np.int32), joined, ambient, weights)
+    signals._flatten(light, np.array([0, 100, 200], np.int32), joined, ambient, weights)
     np.testing.assert_array_equal(light[:400], total)
     mean = np.convolve(total, weights, "same") / np.convolve(np.ones(400), weights, "same")
     np.testing.assert_allclose(light[400:], 1 + (total / mean - 1) / 0.7, rtol=1e-4, atol=1e-5)

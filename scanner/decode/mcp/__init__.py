@@ -7,7 +7,8 @@ soft:
     stripes        pitch from the columns' spectrum; peaks and valleys in every fourth column      4.1
     linking        peaks chained along the stripes; evidence passed along them                     (5.4 grows regions)
     tracks         short chains joined where print breaks a stripe up                              (not in the source)
-    carriers       brightness along the chains; the magnification at which all carriers stand out  4.3
+    signals        brightness along the tracks                                                     4.3
+    carriers       the magnification at which all carriers stand out                               4.3
     magnification  the same at each peak, as a smooth field                                        (4.3 has one for all)
     emissions      amplitude of each carrier over local brightness; likelihood of each stripe      4.4, 4.5
     coherent       the same against the phases that each stripe would give, on a calibrated rig     (not in the source)
@@ -16,13 +17,13 @@ soft:
     dense          rows between the stripes; all maps                                              2.1, 3.7
 
 `locate` says whether the pattern is there at all; `decision` which stripe each peak is; `maps` what a pixel gets;
-`decoder` puts them in order, `door` turns images and maps. What the dissertation's own decoder does is named in each
-module; it is not this one.
+`decoder` puts them in order, `door` turns images and maps; `fits` and `both_ways` are the inner sums of emissions and
+hmm. What the dissertation's own decoder does is named in each module; it is not this one.
 """
 
 from __future__ import annotations
 
-from scanner.decode.mcp import carriers, coherent, local_field, tracks
+from scanner.decode.mcp import carriers, coherent, local_field, signals, tracks
 from scanner.decode.mcp.decoder import McpDecoder, decode_image
 from scanner.patterns import CameraFormat, McpPattern, ProjectorSize
 
@@ -41,4 +42,5 @@ def warm_up() -> None:
     carriers.warm_up()
     coherent.warm_up()
     local_field.warm_up()
+    signals.warm_up()
     tracks.warm_up()

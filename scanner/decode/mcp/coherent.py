@@ -20,6 +20,7 @@ from scanner.crossings import GRID_PX, Crossings
 from scanner.decode.mcp.emissions import OUTLIER, SPREAD, Amplitudes, Waves
 from scanner.decode.mcp.exponentials import log_of
 from scanner.decode.mcp.model import PatternModel
+from scanner.decode.mcp.ranks import median
 from scanner.kernel import contracting_kernel, kernel
 
 Array = NDArray[np.float32]
@@ -110,18 +111,23 @@ def align(seen: Amplitudes, posterior: Array, crossings: Crossings, model: Patte
     phase = np.arctan2(-crossings.sense * wave[:, 1], wave[:, 0]) - omega * (along[peak] + 0.5)
     x, y = x[peak].astype(np.float64), y[peak].astype(np.float64)
     tries = np.linspace(-FURTHEST_PX, FURTHEST_PX, 33)
-    fits = np.cos(phase[None, :] - omega[None, :] * tries[:, None]).sum(axis=1)
+    # Of one carrier all phases turn alike: their sum does.
+    sums = np.bincount(channel, np.cos(phase), model.channels) + 1j * np.bincount(
+        channel, np.sin(phase), model.channels
+    )
+    turns = np.exp(-2j * np.pi * tries[:, None] * model.carriers[None, :])
+    fits = (turns @ sums).real
     solution = np.array([tries[fits.argmax()], 0.0, 0.0])
     design = np.stack([np.ones(len(x)), x, y], axis=1)
     for _ in range(3):
         left = phase - omega * (design @ solution)
         left -= 2 * np.pi * np.rint(left / (2 * np.pi))
-        spread = max(1.48 * float(np.median(np.abs(left))), LEAST_SPREAD / 2)
+        spread = max(1.48 * median(np.abs(left)), LEAST_SPREAD / 2)
         weight = omega * omega / (1 + (left / spread) ** 2)
-        ridge = np.diag((1e-9, 1e-9, 1e-9)) * weight.sum()
+        ridge = 1e-9 * weight.sum() * np.eye(3)
         solution += np.linalg.solve(design.T @ (weight[:, None] * design) + ridge, design.T @ (weight * left / omega))
     left = phase - omega * (design @ solution)
-    deviation = float(np.median(np.abs(left - 2 * np.pi * np.rint(left / (2 * np.pi)))))
+    deviation = median(np.abs(left - 2 * np.pi * np.rint(left / (2 * np.pi))))
     offset, by_x, by_y = (float(v) for v in solution)
     return Alignment(offset, by_x, by_y, 1.48 * deviation, len(peak), deviation < MOST_SPREAD)
 

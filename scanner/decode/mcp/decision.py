@@ -5,7 +5,9 @@ Not here: whether the pattern is there at all (`locate`), and what becomes of th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,7 +49,7 @@ MEAN_LIGHT = np.float32(5 / 6)
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """label (P,) int32, -1 undecided; confidence (P,); light (P,); fine positions; figures for the report."""
+    """label (P,) int32, -1 undecided; confidence (P,); light (P,); fine positions; figures() for the report."""
 
     label: NDArray[np.int32]
     confidence: Array
@@ -55,7 +57,7 @@ class Decision:
     fine: subpixel.Fine
     agreement: description.Agreement
     magnification: float
-    figures: dict[str, Any]
+    figures: Callable[[], dict[str, Any]]
 
 
 def decide(found: Found, model: PatternModel, clock: Stages, crossings: Crossings | None = None) -> Decision:
@@ -90,8 +92,7 @@ def _decide_by(
     floor = np.full(model.channels, 0.03, np.float32)
     tables = hmm.transitions(model.stripes)
     gap = hmm.gaps(sites.start, peaks.y[sites.index], peaks.height[sites.index], found.pitch, model.weakest)
-    votes = np.zeros((len(gap), model.stripes), np.float32)
-    posterior = votes
+    posterior = votes = np.zeros((len(gap), model.stripes), np.float32)
     shift = coherent.NONE
     for again in range(ROUNDS):
         if again and crossings is not None:
@@ -105,7 +106,8 @@ def _decide_by(
                 phases, channels = (crossings, shift), (model, modulation, floor)
                 evidence, stray_log = coherent.settle((plain, stray_log), here, size, posterior, phases, channels)
         with clock.stage("columns' model"):
-            posterior, _stray = hmm.smooth_columns(evidence + votes, sites.start, gap, tables, stray_log)
+            known = evidence + votes if again else evidence
+            posterior, _stray = hmm.smooth_columns(known, sites.start, gap, tables, stray_log)
         with clock.stage("votes"):
             logs = linking.floored_log(posterior, POSTERIOR_FLOOR)
             votes = linking.votes_along(logs, sites.chains, size / (4 * stripes.STEP), VOTE_GAIN)
@@ -125,7 +127,24 @@ def _decide_by(
         agrees = description.agreement(here, plain, model, modulation, path, (sites.start, gap))
     with clock.stage("sub-pixel"):
         fine = subpixel.refine(found.reduced, peaks, chains, label, found.pitch, even=model.even)
-    figures = {
+    shift_said = None if crossings is None else shift
+    figures = partial(_figures, found, size, shift_said, (modulation, floor), agrees, label)
+    light = np.where(tracks.broken, MEAN_LIGHT * peaks.height, np.maximum(seen.light, 0))
+    return Decision(label, confidence, light, fine, agrees, median(scale_field), figures)
+
+
+def _figures(
+    found: Found,
+    size: int,
+    shift: coherent.Alignment | None,
+    channels: tuple[Array, Array],
+    agrees: description.Agreement,
+    label: NDArray[np.int32],
+) -> dict[str, Any]:
+    """For the report; live runs have none, and do without."""
+    peaks, _, tracks, _, search = found.parts()
+    modulation, floor = channels
+    return {
         "pitch_px": round(found.pitch, 3),
         "pitch_match": round(found.match, 3),
         "noise_dn": round(found.noise, 3),
@@ -135,7 +154,7 @@ def _decide_by(
         "modulation": [round(float(m), 3) for m in modulation],
         "noise_floor": [round(float(f), 4) for f in floor],
         "window_px": size,
-        **({} if crossings is None else {"coherent": shift.as_dict()}),
+        **({} if shift is None else {"coherent": shift.as_dict()}),
         "agreement": {key: np.round(value, 4).tolist() for key, value in asdict(agrees).items()},
         "peaks": len(peaks),
         "joined_tracks": int(tracks.joined.sum()),
@@ -147,12 +166,11 @@ def _decide_by(
             "height_share": stripes.HEIGHT_FLOOR,
         },
     }
-    light = np.where(tracks.broken, MEAN_LIGHT * peaks.height, np.maximum(seen.light, 0))
-    return Decision(label, confidence, light, fine, agrees, median(scale_field), figures)
 
 
 def confidence_needed(seen: emissions.Amplitudes, model: PatternModel) -> Array:
     """Posterior below which a peak stays undecided: (P,) float32, more where its own carriers were hardly measured."""
     weakest = float(model.ratio[model.ratio > 0].min())
-    weak = seen.sigma.mean(axis=1) > WEAK * weakest
+    mean = np.add.reduce(np.ascontiguousarray(seen.sigma.T)) / np.float32(model.channels)
+    weak = mean > WEAK * weakest
     return np.where(weak, np.float32(DECIDED_IF_WEAK), np.float32(DECIDED))

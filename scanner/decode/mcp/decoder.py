@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -133,13 +134,19 @@ def _see(
 ) -> tuple[_Seen, Known]:
     pattern.validate(projector)
     upright = upright_image(image, pattern, camera)
-    model = PatternModel.of(pattern, projector, even=even)
+    model = _model_of(pattern, projector, even)
     crossings = None if calibration is None else crossings_of(calibration, pattern, projector)
     seen = None if known is None else _by_what_is_known(upright, model, camera, known, crossings)
     if seen is not None and known is not None:
         return seen, known
     seen = _see_anew(upright, model, camera, crossings)
     return seen, _learnt(seen.found, seen.decided, upside_down=seen.upside_down)
+
+
+@lru_cache(maxsize=8)
+def _model_of(pattern: McpPattern, projector: ProjectorSize, even: bool) -> PatternModel:
+    """Frames of a series ask for the same tables again and again: they are kept."""
+    return PatternModel.of(pattern, projector, even=even)
 
 
 def _by_what_is_known(

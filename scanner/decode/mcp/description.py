@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +85,7 @@ def agreement(
         path: (P,) int32, -1 for stray peaks.
         columns: where columns begin (B + 1,), and the table to each peak (P,) of `hmm.gaps`; 0 is one pitch.
     """
-    words, of_word = np.unique((model.ratio > 0) @ (1 << np.arange(model.channels)), return_inverse=True)
+    words, of_word = model.words
     start, gap = columns
     # Whole columns: every third peak, say, would be the same few stripes wherever columns are alike.
     column = np.repeat(np.arange(len(start) - 1), np.diff(start))
@@ -98,16 +97,36 @@ def agreement(
     agrees = (path[thin] >= 0) & (of_word[np.maximum(path[thin], 0)] == best)
     first = np.zeros(len(path), bool)
     first[start[:-1][start[:-1] < len(path)]] = True
-    pair = ~first & (gap == 0) & (path >= 0) & (np.roll(path, 1) >= 0)
-    follows = path == np.roll(path, 1) + 1
-    own = model.ratio[np.maximum(path, 0)] * (path >= 0)[:, None]
-    over = seen.ratio > 0.5 * modulation * own
-    wraps = np.roll(path, 1) - path > model.stripes // 2
-    parts = (clear, agrees[clear], over[own > 0], wraps[pair] * model.stripes)
-    clear_share, agree, hits, wrapped = (float(part.mean()) if part.size else 0.0 for part in parts)
-    order = float(follows[pair].mean()) if pair.any() else 1.0
-    exchanged = exchanged_words(each, places_in_order(path, first, gap)[thin], of_word, model)
-    return Agreement(clear_share, agree, order, hits, wrapped, exchanged)
+    pairs, follows, wraps = (int(n) for n in _neighbours(path, first, gap, model.stripes // 2))
+    on, over = (int(n) for n in _hits(path, model.ratio, seen.ratio, (0.5 * modulation).astype(np.float32)))
+    clear_share, agree = (float(part.mean()) if part.size else 0.0 for part in (clear, agrees[clear]))
+    exchanged = exchanged_words(each, places_in_order(path[thin], first[thin], gap[thin]), of_word, model)
+    order, wrapped = (follows / pairs, wraps * model.stripes / pairs) if pairs else (1.0, 0.0)
+    return Agreement(clear_share, agree, order, over / on if on else 0.0, wrapped, exchanged)
+
+
+@kernel
+def _neighbours(path: Ints, first: NDArray[np.bool_], gap: Ints, half: int) -> tuple[int, int, int]:
+    """Neighbouring stripes one pitch apart; how many follow one another, and how many go back by more than half."""
+    pairs, follows, wraps = 0, 0, 0
+    for k in range(1, len(path)):
+        if not first[k] and gap[k] == 0 and path[k] >= 0 and path[k - 1] >= 0:
+            pairs += 1
+            follows += path[k] == path[k - 1] + 1
+            wraps += path[k - 1] - path[k] > half
+    return pairs, follows, wraps
+
+
+@kernel
+def _hits(path: Ints, own: Array, seen: Array, half: Array) -> tuple[int, int]:
+    """Carriers that are switched on in the peaks' stripes, and how many are seen with more than half of that."""
+    on, over = 0, 0
+    for k in range(len(path)):
+        for i in range(own.shape[1] if path[k] >= 0 else 0):
+            mean = own[path[k], i]
+            on += mean > 0
+            over += mean > 0 and seen[k, i] > half[i] * mean
+    return on, over
 
 
 @kernel
@@ -170,9 +189,7 @@ def _places(path: Ints, first: NDArray[np.bool_], gap: Ints, place: Ints) -> Non
         begin = end
 
 
-def exchanged_words(
-    each: Array, place: Ints, of_word: NDArray[np.integer[Any]], model: PatternModel
-) -> tuple[int, ...]:
+def exchanged_words(each: Array, place: Ints, of_word: NDArray[np.intp], model: PatternModel) -> tuple[int, ...]:
     """Code words that stand in one another's places, in the order of the description.
 
     A stripe whose place shows another word than the described one, clearly and at most of its peaks, is no proof:
@@ -190,17 +207,42 @@ def exchanged_words(
     stripe_of = {int(of_word[stripe]): stripe for stripe in modulated}
     shows: dict[int, int] = {}
     asked: set[int] = set()
+    count, sums = np.zeros(model.stripes, np.int64), np.zeros((model.stripes, each.shape[1]))
+    _by_place(each, place, count, sums)
+    other = sums.argmax(axis=1)
+    against = np.zeros(model.stripes, np.int64)
+    _contradictions(each, place, other, of_word, against)
     for stripe in modulated:
-        here, own = each[place == stripe], of_word[stripe]
-        if len(here) >= LEAST_PEAKS:
+        if count[stripe] >= LEAST_PEAKS:
             asked.add(stripe)
-            other = int(here.mean(axis=0).argmax())
-            if (here[:, other] - here[:, own] > CLEAR).mean() > 0.5:
-                shows[stripe] = stripe_of[other]
+            if 2 * against[stripe] > count[stripe]:
+                shows[stripe] = stripe_of[int(other[stripe])]
     dark = [stripe for stripe in shows if model.level[stripe] == 0 and shows[stripe] not in asked]
     shows |= {shows[stripe]: stripe for stripe in dark}
     traded = [stripe for stripe in modulated if _comes_back(stripe, shows)]
     return tuple(int(carries[stripe] @ (1 << np.arange(model.channels))) for stripe in traded)
+
+
+@kernel
+def _by_place(each: Array, place: Ints, count: NDArray[np.int64], sums: NDArray[np.float64]) -> None:
+    """Of each place in the order: peaks there, and what they say of each word, added up."""
+    for k in range(len(place)):
+        s = place[k]
+        if 0 <= s < len(count):  # a run may go on past the last stripe
+            count[s] += 1
+            for w in range(each.shape[1]):
+                sums[s, w] += each[k, w]
+
+
+@kernel
+def _contradictions(
+    each: Array, place: Ints, other: NDArray[np.intp], own: NDArray[np.intp], against: NDArray[np.int64]
+) -> None:
+    """Of each place in the order: peaks that clearly show the `other` word instead of its `own`."""
+    for k in range(len(place)):
+        s = place[k]
+        if 0 <= s < len(against):
+            against[s] += each[k, other[s]] - each[k, own[s]] > np.float32(CLEAR)
 
 
 def _comes_back(stripe: int, shows: Mapping[int, int]) -> bool:

@@ -14,7 +14,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.kernel import kernel, summing_kernel
+from scanner.decode.mcp.both_ways import forward_backward
+from scanner.kernel import kernel
 
 Array = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -125,76 +126,7 @@ def smooth_columns(evidence: Array, start: Ints, gap: Ints, tables: Array, stray
     Returns:
         posterior (P, S) float32 and the probability of a stray peak (P,) float32.
     """
-    posterior = np.zeros_like(evidence)
-    stray = np.zeros(len(evidence), np.float32)
-    turned = np.ascontiguousarray(tables.transpose(0, 2, 1))
-    _forward_backward(evidence, start, gap, tables, turned, stray_log, posterior, stray)
-    return posterior, stray
-
-
-NEGLIGIBLE = np.float32(1e-6)
-"""Shares of a distribution below which a state is passed over: far under what JUMP gives every other state."""
-
-
-# Rows of matrices are named by matrix and number: a slice of its own costs more than the loop over 32 states.
-
-
-@summing_kernel
-def _move(source: Array, t: int, tables: Array, g: int, least: np.float32, target: Array) -> None:
-    """target[t] = source[t] @ tables[g], without the sources of `least` or less, which hardly matter."""
-    states = source.shape[1]
-    for s in range(states):
-        target[t, s] = np.float32(0)
-    for p in range(states):
-        a = source[t, p]
-        if a > least:
-            for s in range(states):
-                target[t, s] += a * tables[g, p, s]
-
-
-@summing_kernel
-def _mix(moved: Array, likely: Array, t: int, lost: np.float32, alpha: Array) -> None:
-    """alpha[t + 1] = moved[t] * likely[t] + alpha[t] * lost, normalised."""
-    states = moved.shape[1]
-    total = np.float32(0)
-    for s in range(states):
-        value = moved[t, s] * likely[t, s] + alpha[t, s] * lost
-        alpha[t + 1, s] = value
-        total += value
-    scale = np.float32(1) / max(total, np.float32(1e-30))
-    for s in range(states):
-        alpha[t + 1, s] *= scale
-
-
-@summing_kernel
-def _likelihoods(evidence: Array, k: int, stray_log: np.float32, t: int, likely: Array) -> np.float32:
-    """likely[t] = evidence[k]'s likelihoods, the largest at 1 - STRAY; returns that of a stray peak."""
-    states = evidence.shape[1]
-    top = stray_log
-    for s in range(states):
-        top = max(top, evidence[k, s])
-    for s in range(states):
-        # exp(x) = (1 + x / 1024)^1024, exact to 1e-3 where it matters, in vector registers.
-        x = max(np.float32(1) + (evidence[k, s] - top) * np.float32(1 / 1024), np.float32(0))
-        for _ in range(10):
-            x *= x
-        likely[t, s] = np.float32(1 - STRAY) * x
-    lost: np.float32 = np.float32(STRAY) * np.exp(stray_log - top)
-    return lost
-
-
-@summing_kernel
-def _mix_back(moved: Array, t: int, lost: np.float32, beta: Array) -> None:
-    """beta[t] = moved[t] + beta[t + 1] * lost, normalised."""
-    states = moved.shape[1]
-    total = np.float32(0)
-    for s in range(states):
-        value = moved[t, s] + beta[t + 1, s] * lost
-        beta[t, s] = value
-        total += value
-    scale = np.float32(1) / max(total, np.float32(1e-30))
-    for s in range(states):
-        beta[t, s] *= scale
+    return forward_backward(evidence, start, gap, tables, stray_log, STRAY)
 
 
 @kernel
@@ -203,56 +135,6 @@ def _longest(start: Ints) -> int:
     for b in range(len(start) - 1):
         longest = max(longest, start[b + 1] - start[b])
     return longest
-
-
-@summing_kernel
-def _forward_backward(
-    evidence: Array,
-    start: Ints,
-    gap: Ints,
-    tables: Array,
-    turned: Array,
-    stray_log: Array,
-    posterior: Array,
-    stray: Array,
-) -> None:
-    states = evidence.shape[1]
-    longest = _longest(start)
-    alpha = np.empty((longest + 1, states), np.float32)
-    beta = np.empty((longest + 1, states), np.float32)
-    moved = np.empty((longest, states), np.float32)
-    likely = np.empty((longest, states), np.float32)
-    product = np.empty((longest, states), np.float32)
-    lost = np.empty(longest, np.float32)
-    for b in range(len(start) - 1):
-        first, size = start[b], start[b + 1] - start[b]
-        for s in range(states):
-            alpha[0, s] = np.float32(1) / np.float32(states)
-            beta[size, s] = np.float32(1)
-        for t in range(size):
-            lost[t] = _likelihoods(evidence, first + t, stray_log[first + t], t, likely)
-            if t == 0:
-                for s in range(states):
-                    moved[0, s] = alpha[0, s]
-            else:
-                _move(alpha, t, tables, gap[first + t], NEGLIGIBLE, moved)
-            # The state of a stray peak is that of the peak before it.
-            _mix(moved, likely, t, lost[t], alpha)
-        for t in range(size - 1, -1, -1):
-            bad, good, top = np.float32(0), np.float32(0), np.float32(0)
-            for s in range(states):
-                product[t, s] = likely[t, s] * beta[t + 1, s]
-                top = max(top, product[t, s])
-                posterior[first + t, s] = moved[t, s] * product[t, s]
-                good += posterior[first + t, s]
-                bad += alpha[t, s] * lost[t] * beta[t + 1, s]
-            scale = np.float32(1) / max(good + bad, np.float32(1e-30))
-            for s in range(states):
-                posterior[first + t, s] *= scale
-            stray[first + t] = bad * scale
-            if t > 0:
-                _move(product, t, turned, gap[first + t], NEGLIGIBLE * top, moved)
-                _mix_back(moved, t, lost[t], beta)
 
 
 def best_paths(evidence: Array, start: Ints, gap: Ints, tables: Array, stray_log: Array) -> Ints:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scanner.decode.mcp import carriers, linking, magnification, stripes
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.ranks import quantiles
+from scanner.decode.mcp.signals import Signals, signals_along
 from scanner.decode.mcp.tracks import Tracks, join
 from scanner.patterns import CameraFormat
 
@@ -83,7 +84,7 @@ class Found:
     peaks: stripes.Peaks | None = None
     chains: linking.Chains | None = None
     tracks: Tracks | None = None
-    signals: carriers.Signals | None = None
+    signals: Signals | None = None
     search: carriers.CarrierSearch | None = None
 
     @property
@@ -104,7 +105,7 @@ class Found:
 
     def parts(
         self,
-    ) -> tuple[stripes.Peaks, linking.Chains, Tracks, carriers.Signals, carriers.CarrierSearch]:
+    ) -> tuple[stripes.Peaks, linking.Chains, Tracks, Signals, carriers.CarrierSearch]:
         """What a search without a fault has found."""
         assert self.peaks is not None  # noqa: S101  (no fault means that the search went to its end)
         assert self.chains is not None  # noqa: S101
@@ -214,7 +215,7 @@ def _search(
         found.beyond = np.zeros(len(found.peaks), np.bool_)
         if not beyond.any():
             found.beyond = linking.silhouettes(found.reduced, found.peaks, found.tracks.links)
-        found.signals = carriers.signals_along(image, found.tracks, found.pitch, longest, camera.max_value)
+        found.signals = signals_along(image, found.tracks, found.pitch, longest, camera.max_value)
     if len(found.peaks) == 0:
         found.fault = "no stripes stand out of the noise"
         return found

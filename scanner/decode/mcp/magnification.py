@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from scanner.decode.mcp import local_field
 from scanner.decode.mcp.carriers import CarrierSearch, places
+from scanner.decode.mcp.fits import FIELD_STEP
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.ranks import quantiles
 from scanner.decode.mcp.stripes import STEP
@@ -25,9 +26,6 @@ Ints = NDArray[np.int32]
 
 FIELD_RANGE = 0.07
 """Magnifications tried about the search's own, relative: what depth and the search's steps leave."""
-
-FIELD_STEP = 0.005
-"""Steps of the tables of emissions: .05 cycles at the end of a window of 20 periods."""
 
 LEAST_OFF = FIELD_STEP
 """Half of the windows lie nearer than this to a smooth field that holds (.0044 at most, on reference scenes; .008 and
@@ -46,15 +44,18 @@ def window_px(model: PatternModel, scale: float) -> int:
     return int(STEP * np.clip(np.ceil(1.5 * beat / STEP), 6, 128))
 
 
-def fit_field(
+def fit_fields(
     light: Array,
     tracks: Tracks,
     model: PatternModel,
     search: CarrierSearch,
     size: int,
     shape: tuple[int, int],
-) -> Array:
-    """The magnification at each place of the tracks.
+) -> tuple[Array, ...]:
+    """The magnification at each place of the tracks: a smooth field; and where single windows stay away from it, a
+    second one found place by place.
+
+    Which of two is right shows when stripes are decoded: print can feign a field that varies, too.
 
     Args:
         light: (4 N,) float32, along the tracks.
@@ -64,23 +65,7 @@ def fit_field(
         shape: (H, W) px.
 
     Returns:
-        (N,) float32: magnification relative to `search.scale`.
-    """
-    return _fit(light, tracks, model, search, size, shape)[0]
-
-
-def fit_fields(
-    light: Array,
-    tracks: Tracks,
-    model: PatternModel,
-    search: CarrierSearch,
-    size: int,
-    shape: tuple[int, int],
-) -> tuple[Array, ...]:
-    """`fit_field`'s smooth field; and where single windows stay away from it, a second one found place by place.
-
-    Arguments are those of `fit_field`. Which of two is right shows when stripes are decoded: print can feign a field
-    that varies, too.
+        (N,) float32 each: magnification relative to `search.scale`.
     """
     smooth, off = _fit(light, tracks, model, search, size, shape)
     if off <= LEAST_OFF:
@@ -157,7 +142,8 @@ def _votes(
     curve = left - 2 * top + right
     shift = np.where(curve < 0, 0.5 * (left - right) / np.minimum(curve, -1e-12), 0.0)
     # A window counts by how far its best stands above its middle: those without carriers have none.
-    weight = np.where(inside, top - np.median(power, axis=1), 0.0).clip(0, None)
+    middle = np.partition(power, count // 2, axis=1)[:, count // 2]
+    weight = np.where(inside, top - middle, 0.0).clip(0, None)
     return tries[first + b] + np.clip(shift, -1, 1) * step, weight
 
 

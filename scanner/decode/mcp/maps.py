@@ -53,7 +53,7 @@ def maps_of(image: Image, found: Found, decided: Decision, model: PatternModel, 
             "names are not to be trusted"
         )
     figures = {
-        **decided.figures,
+        **decided.figures(),
         "peaks_kept": int((label >= 0).sum()),
         "stages_ms": {k: round(v, 2) for k, v in clock.ms.items()},
     }

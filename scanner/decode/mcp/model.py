@@ -72,6 +72,33 @@ class PatternModel:
         return float(self.level[self.level > 0].min() / self.level.max())
 
     @cached_property
+    def usual(self) -> list[tuple[float, float]]:
+        """Of each channel the quantile of its peaks by which strong ones are told, 0 if it carries nothing, and the
+        amplitude of a stripe at it.
+        """
+        found = []
+        for own in self.ratio[self.level > 0].T:
+            share = 1 - float((own > 0).mean()) / 2
+            found.append((share, float(np.quantile(own, share, method="nearest"))) if share < 1 else (0.0, 0.0))
+        return found
+
+    @cached_property
+    def amplitudes(self) -> list[NDArray[np.float32]]:
+        """Of each channel the different ratios, from the least: 2 ("equal") or up to N + 1 ("composite")."""
+        return [np.unique(own) for own in self.ratio.T]
+
+    @cached_property
+    def shows(self) -> Array:
+        """(A, S) float32, 1 where a stripe has that of the `amplitudes`, channel after channel, else 0."""
+        each = [own == value for own, values in zip(self.ratio.T, self.amplitudes, strict=True) for value in values]
+        return np.asarray(each, np.float32)
+
+    @cached_property
+    def words(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Different code words, by the channels that are on; and which of them each stripe (S,) has."""
+        return np.unique((self.ratio > 0) @ (1 << np.arange(self.channels)), return_inverse=True)
+
+    @cached_property
     def separation(self) -> float:
         """Smallest distance between two carriers, and from the lowest to DC, cycles per projector pixel."""
         ordered = np.sort(np.concatenate(([0.0], self.carriers)))

@@ -1,5 +1,5 @@
-"""Medians and percentiles of many float32 numbers, by sorting them: NumPy sorts float32 in vector registers, in a tenth
-of the time that its own median takes over 70,000 of them.
+"""Medians and percentiles of many float32 numbers, by sorting or parting them: NumPy does both in vector registers, in
+a tenth of the time that its own median takes over 70,000 of them.
 """
 
 from __future__ import annotations
@@ -14,11 +14,18 @@ def quantiles(values: NDArray[Any], *shares: float) -> list[float]:
     """Values below which those shares (0..1) of `values` lie, between two by a straight line, as `numpy.quantile`.
 
     Args:
-        values: float32 of any shape, at least one, none of them NaN.
+        values: float32 or float64 of any shape, at least one, none of them NaN.
         shares: wanted.
     """
-    ordered = np.sort(values, axis=None)
-    last = len(ordered) - 1
+    last = values.size - 1
+    if len(shares) == 1:
+        # One place is parted in half the time of a sort, two in twice as much.
+        low = min(int(shares[0] * last), last)
+        ordered = np.partition(values, low, axis=None)
+        if low < last:
+            ordered[low + 1] = ordered[low + 1 :].min()
+    else:
+        ordered = np.sort(values, axis=None)
     found = []
     for share in shares:
         place = share * last

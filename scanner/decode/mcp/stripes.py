@@ -9,6 +9,7 @@ Not here: which stripe a peak is, and where it lies to a fraction of a pixel.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -125,9 +126,19 @@ def noise_of(reduced: Array) -> float:
 
     From second differences along the column, which vanish on a triangle's flanks; the median ignores the peaks.
     """
-    part = reduced[:: max(1, len(reduced) // 64)]
-    second = part[:, 2:] - 2 * part[:, 1:-1] + part[:, :-2]
-    return float(median(np.abs(second)) * 1.4826 / np.sqrt(6))
+    return float(median(_second_differences(reduced, max(1, len(reduced) // 64))) * 1.4826 / np.sqrt(6))
+
+
+@kernel
+def _second_differences(reduced: Array, hop: int) -> Array:
+    """Their magnitudes along every `hop`-th column."""
+    columns, rows = reduced.shape
+    found = np.empty(((columns + hop - 1) // hop, rows - 2), np.float32)
+    for n in range(len(found)):
+        line, out = reduced[n * hop], found[n]
+        for y in range(len(out)):
+            out[y] = abs((line[y + 2] - np.float32(2) * line[y + 1]) + line[y])
+    return found
 
 
 def estimate_pitch(reduced: Array, model: PatternModel, count: int = 1) -> list[tuple[float, float]]:
@@ -196,8 +207,8 @@ def find_peaks(reduced: Array, pitch: float, carrier_px: float, noise: float, we
     # A Gaussian of sigma a, b leaves 1 / sqrt(4 pi a b) of white noise.
     left = noise / np.sqrt(max(1.0, 4 * np.pi * sigma_x * sigma_y))
     table = _peaks_of(smooth, np.float32(5 * left + 1e-3), np.float32(pitch))
-    start, rows = table
-    heights = rows[:, 1]
+    start, rows = table[0], np.ascontiguousarray(table[1].T)
+    heights = rows[1]
     if not len(heights):
         return _as_peaks(start, rows)
     floor = HEIGHT_FLOOR * quantiles(heights, 0.99)[0]
@@ -213,7 +224,7 @@ def find_peaks(reduced: Array, pitch: float, carrier_px: float, noise: float, we
     keep = ((heights >= floor) | dim) & (heights >= 8 * left)
     counts = np.add.reduceat(np.append(keep, False).astype(np.int32), np.minimum(start[:-1], len(keep)))
     counts[start[:-1] == start[1:]] = 0
-    return _as_peaks(np.concatenate(([0], np.cumsum(counts))).astype(np.int32), rows[keep])
+    return _as_peaks(np.concatenate(([0], np.cumsum(counts))).astype(np.int32), [row[keep] for row in rows])
 
 
 def _smoothed(reduced: Array, sigma_x: float, sigma_y: float) -> Array:
@@ -239,8 +250,8 @@ def spacing(peaks: Peaks) -> float:
     return median(apart) if apart.size else 0.0
 
 
-def _as_peaks(start: NDArray[np.int32], rows: Array) -> Peaks:
-    y, height, valley, above, below, clear = (np.ascontiguousarray(rows[:, k]) for k in range(6))
+def _as_peaks(start: NDArray[np.int32], rows: Iterable[Array]) -> Peaks:
+    y, height, valley, above, below, clear = rows
     return Peaks(start, y, height, valley, above, below, clear.astype(np.uint8))
 
 
@@ -253,24 +264,25 @@ def _turning_points(line: Array, delta: np.float32, tops: NDArray[np.int32], low
     n = 0
     rising = True
     low_at, top_at = 0, 0
+    low = top = line[0]
     for y in range(1, len(line)):
         value = line[y]
         if rising:
-            if value > line[top_at]:
-                top_at = y
-            elif value < line[top_at] - delta:
-                if line[top_at] > line[low_at] + delta or n == 0:
+            if value > top:
+                top_at, top = y, value
+            elif value < top - delta:
+                if top > low + delta or n == 0:
                     lows[n] = low_at
                     tops[n] = top_at
                     n += 1
                 rising = False
-                low_at = y
-        elif value < line[low_at]:
-            low_at = y
-        elif value > line[low_at] + delta:
+                low_at, low = y, value
+        elif value < low:
+            low_at, low = y, value
+        elif value > low + delta:
             rising = True
-            top_at = y
-    if rising and n > 0 and line[top_at] > line[low_at] + delta:  # cut by the column's end
+            top_at, top = y, value
+    if rising and n > 0 and top > low + delta:  # cut by the column's end
         lows[n] = low_at
         tops[n] = top_at
         n += 1

@@ -102,8 +102,11 @@ def join(peaks: Peaks, chains: Chains, pitch: float, long: int) -> Tracks:
     smooth = max(1, round(pitch / (2 * STEP)))
     lines = _lines(peaks, chains, rank, smooth)
     alone, reach = np.flatnonzero((rank < 0) & (chains.lengths < piece)), np.float32(BESIDE * pitch)
+    before = rank.copy()
     _adopt(alone, peaks.y, chains.order, chains.start, chains.column, lines.first, lines.begin, lines.y, reach, rank)
-    return _joined(peaks, chains, rank, _lines(peaks, chains, rank, smooth))
+    if not np.array_equal(rank, before):
+        lines = _lines(peaks, chains, rank, smooth)
+    return _joined(peaks, chains, rank, lines)
 
 
 @dataclass(frozen=True, eq=False)
