@@ -120,7 +120,7 @@ class Guide:
             if found is not None:
                 return found
         if len(self.poses) < GOOD_POSES:
-            return "tilts, depths and picture are covered: repeat them elsewhere, with other tilts"
+            return f"all is covered, more of it makes it sure: {self._least()}"
         return "enough for a calibration: q ends, or go on with other tilts and places"
 
     def lacking(self) -> str:
@@ -174,6 +174,14 @@ class Guide:
         if not missing:
             return None
         return f"move it to the {FIELDS[missing[0]]} of the picture"
+
+    def _least(self) -> str:
+        """The side and the field that the fewest poses have."""
+        standings = self.standings
+        side = min(SIDES, key=lambda side: sum(_tilted_to(s, side) for s in standings))
+        each = np.sum([self._fields((pose,)) for pose in self.poses], axis=0)
+        field = min(_CORNERS_FIRST, key=lambda k: int(each[k]))
+        return f"at the {FIELDS[field]} of the picture, its {side} towards the camera"
 
     def _fields(self, poses: tuple[Seen, ...]) -> NDArray[np.bool_]:
         covered = np.zeros(9, dtype=bool)

@@ -154,6 +154,9 @@ class _Problem:
         self._member = np.repeat(np.eye(len(sets)), [s.shifts for s in sets], axis=0)
         self.freedom = grey.shape[1] - len(sets) - 2
         self.kept = int(KEPT * len(grey))
+        # Of light ^ 1, for every exponent: heights grow with the exponent's distance from where light varies most, and
+        # shares of them would shrink with it wherever noise is most of a residual, as on the dark squares of prints.
+        self._squared = np.maximum(self._heights(self._linear(start, 1.0)).mean(axis=1), 1.0) ** 2
 
     def misfit(self, exponent: float) -> tuple[float, NDArray[np.float64]]:
         """(sum of squared residuals over squared fringe height, of the pixels that fit best; coordinates (n,))."""
@@ -161,17 +164,18 @@ class _Problem:
         parameters = self._linear(y, exponent)
         for _ in range(_STEPS):
             light, slope = self._light(y, exponent)
-            heights = parameters[:, 1:] @ self._member.T
+            heights = self._heights(parameters)
             jacobian = np.concatenate([self._columns(light), (heights * slope)[:, :, None]], axis=2)
             change = _least_squares(jacobian, self.grey - parameters[:, :1] - heights * light)
             parameters = parameters + change[:, :-1]
             y = y + np.clip(change[:, -1], -5, 5)
         light, _ = self._light(y, exponent)
-        heights = parameters[:, 1:] @ self._member.T
-        left = (self.grey - parameters[:, :1] - heights * light) ** 2 / np.maximum(heights.mean(axis=1), 1.0)[
-            :, None
-        ] ** 2
+        left = (self.grey - parameters[:, :1] - self._heights(parameters) * light) ** 2 / self._squared[:, None]
         return float(np.sort(left.sum(axis=1))[: self.kept].sum()), y
+
+    def _heights(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, F) b of each frame's set."""
+        return np.asarray(parameters[:, 1:] @ self._member.T)
 
     def _linear(self, y: NDArray[np.float64], exponent: float) -> NDArray[np.float64]:
         light, _ = self._light(y, exponent)

@@ -170,14 +170,15 @@ def _facts(found: LevelResponse | Response) -> list[tuple[str, str]]:
     if isinstance(found, Response):
         projected = "" if found.gamma is None else f"{found.gamma:.3f}"
         return [
-            ("exponent", f"{found.exponent:.3f} +- {found.sigma:.3f} left in this capture (1: the light is linear)"),
+            ("exponent", f"{found.exponent:.3f} left in this capture (1: the light is linear)"),
+            ("+-", f"{2 * found.sigma:.3f} (k = 2) by the frames' noise; blur makes an exponent up to some 1 % low"),
             ("ripple", f"{found.ripple_px:.3f} projector px rms in this capture"),
             ("misfit", f"{found.misfit_before:.2%} of the fringes, {found.misfit_after:.2%} with this exponent"),
             ("gamma to undo", projected or "the table used, followed by light ^ (1 / exponent)"),
         ]
     fits = "an exponent fits" if "gamma" in found.response else "no exponent fits: a table"
     return [
-        ("gamma", f"{found.gamma:.4f} +- {found.sigma:.4f}, with {found.misfit:.2%} of white left: {fits}"),
+        ("gamma", f"{found.gamma:.4f} +- {2 * found.sigma:.4f} (k = 2), with {found.misfit:.2%} of white left: {fits}"),
         ("levels", f"{len(found.levels)}, seen by {found.pixels:,} pixels"),
     ]
 

@@ -220,6 +220,7 @@ class _Loop:
         self._seen: Any = "no picture of the camera yet"
         self._progress_s = time.monotonic()
         self._told = False
+        self._advice = ""
         self._levels = levels
         self.response: dict[str, Any] | None = None if levels is None else levels.response
         """the projector's, where scans should undo it"""
@@ -292,7 +293,9 @@ class _Loop:
     def _say_next(self) -> None:
         guide = self._session.guide
         if guide is not None and len(guide.poses) < self._asked.poses:
-            say(f"next: {guide.advice()}")
+            advice = guide.advice()
+            say("next: as before" if advice == self._advice else f"next: {advice}")
+            self._advice = advice
 
     def _last_line(self) -> str:
         return self._seen if isinstance(self._seen, str) else self._seen.trouble or "the target stands as before"
