@@ -1,8 +1,9 @@
 """A USB3 Vision camera on the guest's own USB: real descriptors, real bulk transfers, seen by the kernel and by Aravis.
 
 The kernel's FunctionFS gives this process the device's end of dummy_hcd's second port. Control channel and stream are
-those of the standard (GenCP 1.2, USB3 Vision 1.0); features and their registers are the simulated GigE camera's, moved
-out of the way of the standard's own. It shows a ramp that moves on with the frame's number, and has no light to see.
+those of the standard (GenCP 1.2, USB3 Vision 1.0); features, their registers and the sensor that exposes are the
+simulated GigE camera's, registers moved out of the way of the standard's own. It shows a ramp that moves on with the
+frame's number, or an even light where it is told one.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import subprocess
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Self
 
 import numpy as np
@@ -21,10 +23,18 @@ from numpy.typing import NDArray
 
 from drivers.simulated import gige_features as f
 from drivers.simulated.gige_registers import OWN_AT, XML_AT, Identity, Refused, Registers
+from drivers.simulated.gige_sensor import Sensor
+from drivers.simulated.gige_stream import Picture
+from drivers.simulated.gige_time import DeviceClock
+from drivers.simulated.options import CameraOptions
+from scanner.clock import MonotonicClock
 
 VENDOR, MODEL, SERIAL = "fringed", "simulated-usb3", "U3V1"
 WIDTH, HEIGHT = 320, 240
-RATE_HZ = 20.0
+SENSOR = CameraOptions(readout_us=30_000.0, period_us=50_000.0)
+"""Slow: a message to it takes the guest some milliseconds, and the second of two must find it busy"""
+FULL_NS = 16_000_000
+"""The exposure at which a picture is as bright as the light"""
 
 _GADGET = Path("/sys/kernel/config/usb_gadget/usb3")
 _ENDPOINTS = Path("/dev/usb3-camera")
@@ -35,6 +45,7 @@ _SBRM_AT, _SIRM_AT, _MANIFEST_AT, _GIGE_AT = 0x2000, 0x3000, 0x4000, 0x8000
 _CONTROL = 0x0004
 """SI_CONTROL, bit 0: the stream is enabled"""
 _LEADER_BYTES, _TRAILER_BYTES, _MESSAGE_BYTES = 52, 32, 1024
+_IMAGE, _WITH_CHUNKS = 0x0001, 0x4000
 _READ, _WRITE = 0x0800, 0x0802
 _MAGIC = 0x43563355
 _ANSWER_MS = 2000
@@ -83,37 +94,57 @@ class _Features(Registers):
         return len(self._xml)
 
 
+class _World:
+    """What the sensor exposes on: an even light."""
+
+    def __init__(self) -> None:
+        self.light = 0
+        self.clock = MonotonicClock()
+        self.lines: dict[str, Any] = {}
+        self.rig = SimpleNamespace(calibration=SimpleNamespace(camera=SimpleNamespace(size=(WIDTH, HEIGHT))))
+
+    def render(
+        self, start_ns: int, exposure_ns: int, rolling_ns: int, gain_db: float, bits: int, number: int, frame: Any
+    ) -> None:
+        """Into `frame`, (H, W)."""
+        frame[...] = min(round(self.light * exposure_ns / FULL_NS), 255) << max(0, bits - 8)
+
+
 class Usb3Camera:
     """Plugged in from `__init__` to `close`."""
 
     def __init__(self) -> None:
-        self.frames_sent = 0
         self._features = _Features()
         self._memory = bytearray(0x5000)
-        self._acquiring = threading.Event()
-        self._triggers = threading.Semaphore(0)
+        self._world: Any = _World()
+        self._clock = DeviceClock(1_000_000_000, 0, 0.0, 0)
         self._sending = threading.Lock()
         self._closing = False
+        stream: Any = self  # it sends; what else a wire does concerns no sensor
+        self._sensor = Sensor(self._world, SENSOR, self._features, stream, self._clock, queue=0)
         self._fill()
         self._build()
         self._files = [os.open(_ENDPOINTS / f"ep{number}", os.O_RDWR) for number in (4, 5, 6)]
         self._answers, self._commands, self._stream = self._files
-        self._threads = [threading.Thread(target=run, daemon=True) for run in (self._serve, self._send, self._drain)]
+        self._threads = [threading.Thread(target=run, daemon=True) for run in (self._serve, self._drain)]
         for thread in self._threads:
             thread.start()
         (_GADGET / "UDC").write_text(_CONTROLLER)
 
     @staticmethod
     def picture(number: int) -> NDArray[np.uint8]:
-        """What frame `number` (from 0 at each start) shows."""
+        """What frame `number` (from 0 at each start) shows while there is no light."""
         return np.add.outer(np.arange(HEIGHT), np.arange(WIDTH) + number).astype(np.uint8)
+
+    def set_light(self, level: int) -> None:
+        """Of pictures that begin from now on; 0: they show the ramp."""
+        self._world.light = level
 
     def close(self) -> None:
         """Pull the plug, and take the gadget apart."""
         self._closing = True
-        self._acquiring.set()
-        self._triggers.release()
         (_GADGET / "UDC").write_text("\n")
+        self._sensor.close()
         for thread in self._threads:
             thread.join(5)
             assert not thread.is_alive()
@@ -182,40 +213,46 @@ class Usb3Camera:
         put(_SIRM_AT + 0x10, "<II", _LEADER_BYTES, _TRAILER_BYTES)
         put(_MANIFEST_AT, "<Q", 1)
         put(_MANIFEST_AT + 8, "<HBBIQQ", 0, 0, 1, 0, XML_AT, self._features.document_bytes)
-        features = self._features
+        features, sensor = self._features, self._sensor
         features.set_number(f.EXPOSURE_TIME, 1000.0)
-        features.set_number(f.READOUT_TIME, 1000.0)
-        features.set_number(f.FRAME_RATE_MAX, RATE_HZ)
-        features.set_number(f.FRAME_RATE, RATE_HZ)
-        features.on_write(f.ACQUISITION_START, lambda _: self._start())
+        features.set_number(f.READOUT_TIME, SENSOR.readout_us)
+        features.on_write(f.ACQUISITION_START, lambda _: sensor.start())
         features.on_write(f.ACQUISITION_STOP, lambda _: self._stop())
-        features.on_write(f.TRIGGER_SOFTWARE, lambda _: self._triggers.release())
+        features.on_write(f.TRIGGER_SOFTWARE, lambda _: sensor.software_trigger())
+        features.on_write(f.COUNTER_RESET, lambda _: sensor.reset_counter())
+        features.on_read(f.COUNTER_VALUE, self._read_counter)
         features.on_write(f.LATCH, lambda _: self._latch())
-        for at in (f.WIDTH, f.HEIGHT, f.PIXEL_FORMAT):
+        for at in (f.WIDTH, f.HEIGHT, f.PIXEL_FORMAT, f.EXPOSURE_TIME, f.CHUNK_ACTIVE):
             features.on_write(at, lambda _: self._fit())
+        for index in f.CHUNKS.values():
+            features.on_write(f.CHUNK_ENABLE + 4 * index, lambda _: self._fit())
         self._fit()
 
     def _put(self, at: int, form: str, *values: int) -> None:
         struct.pack_into(form, self._memory, at, *values)
 
     def _fit(self) -> None:
-        bits = self._features.word(f.PIXEL_FORMAT) >> 16 & 0xFF
-        payload = self._features.word(f.WIDTH) * self._features.word(f.HEIGHT) * bits // 8
+        """Registers that follow from others."""
+        payload = self._sensor.payload_size()
         self._features.set_word(f.PAYLOAD_SIZE, payload)
         self._put(_SIRM_AT + 0x08, "<Q", payload)
+        fastest = 1e9 / SENSOR.period_ns(round(1e3 * self._features.number(f.EXPOSURE_TIME)))
+        self._features.set_number(f.FRAME_RATE_MAX, fastest)
+        if not 0 < self._features.number(f.FRAME_RATE) <= fastest:
+            self._features.set_number(f.FRAME_RATE, fastest)
 
     def _latch(self) -> None:
-        now = time.monotonic_ns()
+        now = self._clock.ticks(time.monotonic_ns())
         self._features.set_word(f.LATCHED_HIGH, now >> 32)
         self._features.set_word(f.LATCHED_LOW, now)
 
-    def _start(self) -> None:
-        self.frames_sent = 0
-        self._acquiring.set()
+    def _read_counter(self) -> None:
+        count = self._sensor.counter(time.monotonic_ns(), self._features.word(f.COUNTER_SOURCE))
+        self._features.set_word(f.COUNTER_VALUE, count)
 
     def _stop(self) -> None:
         """A frame under way is sent to its end: the host takes transfers back only after this."""
-        self._acquiring.clear()
+        self._sensor.stop()
         if self._sending.acquire(timeout=_ANSWER_MS / 2e3):
             self._sending.release()
 
@@ -258,37 +295,40 @@ class Usb3Camera:
 
     # --- the stream ---------------------------------------------------------------------------------------------------
 
-    def _send(self) -> None:
-        while not self._closing:
-            self._acquiring.wait()
-            if self._features.word(f.TRIGGER_MODE):
-                if self._triggers.acquire(timeout=0.1):
-                    self._send_frame()
-            else:
-                self._send_frame()
-                time.sleep(1.0 / self._features.number(f.FRAME_RATE))
-
-    def _send_frame(self) -> None:
+    def send(self, block: int, picture: Picture, content: memoryview, _bytes: int, _delay_s: float) -> None:
+        """A frame that the sensor has read out, on its thread; `block` counts from 1."""
         with self._sending:
-            if self._closing or not self._acquiring.is_set():
+            if self._closing or not self._sensor.acquiring:
                 return
-            number, self.frames_sent = self.frames_sent, self.frames_sent + 1
             try:
-                for part in self._parts(number):
+                for part in self._parts(block - 1, picture, bytearray(content)):
                     os.write(self._stream, part)
             except OSError:
-                self._acquiring.clear()  # the host went away, or took its transfers back
+                self._sensor.stop()  # the host went away, or took its transfers back
 
-    def _parts(self, number: int) -> tuple[bytes, bytes, bytes]:
+    def _parts(self, number: int, picture: Picture, content: bytearray) -> tuple[bytes, bytes, bytes]:
         """Leader, payload and trailer of a frame (USB3 Vision 1.0, 5.4)."""
-        word = self._features.word
-        payload = self.picture(number)[: word(f.HEIGHT), : word(f.WIDTH)].tobytes()
-        payload = payload.ljust(word(f.PAYLOAD_SIZE), b"\0")
-        place = (word(f.PIXEL_FORMAT), word(f.WIDTH), word(f.HEIGHT), 0, 0, 0, 0)
+        if not self._world.light and picture.pixel_format == f.MONO8:
+            x, y, width, height = picture.offset_x, picture.offset_y, picture.width, picture.height
+            content[: width * height] = self.picture(number)[y : y + height, x : x + width].tobytes()
+        kind = _IMAGE
+        if picture.has_chunks:
+            kind |= _WITH_CHUNKS
+            _turn_tags(content)
+        place = (picture.pixel_format, picture.width, picture.height, picture.offset_x, picture.offset_y, 0, 0)
         leader = struct.pack("<4sHHQ", b"U3VL", 0, _LEADER_BYTES, number)
-        leader += struct.pack("<HHQIIIIIHH", 0, 1, time.monotonic_ns(), *place)
+        leader += struct.pack("<HHQIIIIIHH", 0, kind, picture.stamp, *place)
         trailer = struct.pack("<4sHHQ", b"U3VT", 0, _TRAILER_BYTES, number)
-        return leader, payload, trailer + struct.pack("<HHQI", 0, 0, len(payload), word(f.HEIGHT))
+        return leader, bytes(content), trailer + struct.pack("<HHQI", 0, 0, len(content), picture.height)
+
+
+def _turn_tags(content: bytearray) -> None:
+    """Behind each chunk its name and size, which are little-endian here, and big-endian in GigE Vision."""
+    end = len(content)
+    while end > 0:
+        name, size = struct.unpack_from(">II", content, end - 8)
+        struct.pack_into("<II", content, end - 8, name, size)
+        end -= 8 + size
 
 
 def node() -> Path:
