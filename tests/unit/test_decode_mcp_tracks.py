@@ -115,3 +115,25 @@ def test_between_two_sites_of_a_joined_track_one_decided_is_enough():
         every, confidence = linking.between_sites(label, sure, sites, chains, np.array([joined]))
         assert list(every) == expected
         assert (confidence[[1, 3]] == ([np.float32(0.9), np.float32(0.95)] if joined else [0, 0])).all()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_light_along_a_track_is_the_mean_over_its_rows_above_the_valleys(dtype):
+    random = np.random.default_rng(6)
+    image = random.integers(0, 250, (60, 48)).astype(dtype)
+    image[28:31, 20:23] = 255  # clipped
+    y = np.float32([20, 20.2, 20.1, 22.9, 25.4, 29, 29.2, 29.1, 29.3, 40, 57.5, 59])
+    valley = random.uniform(0, 9, len(y)).astype(np.float32)
+    column = np.arange(len(y), dtype=np.int32)
+    each = linking.Chains(column, np.array([0, len(y)], np.int32), column)
+    peaks = stripes.Peaks(np.arange(len(y) + 1, dtype=np.int32), y, y, valley, y, y, np.ones(len(y), np.uint8))
+    found = signals.signals_along(image, tracks.single(peaks, each), 18.0, 8.0, 255)
+    place = np.clip((np.arange(image.shape[1]) - 1.5) / 4, 0, len(y) - 1)
+    high = np.zeros(len(y))
+    for x, (row, base) in enumerate(zip(np.interp(place, column, y), np.interp(place, column, valley), strict=True)):
+        middle = int(np.floor(row + 0.5))
+        seen = image[max(middle - 3, 0) : middle + 4, x]
+        assert found.light[x] == pytest.approx(seen.mean() - base, abs=1e-3)
+        high[x // 4] += (seen == 255).mean() / 4
+    np.testing.assert_allclose(found.clipped, high, atol=1e-6)
+    assert high.max() > 0.2
