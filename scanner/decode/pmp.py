@@ -6,7 +6,8 @@ Phase measuring profilometry is Srinivasan's, Liu's and Halioua's (1984); coarse
 Frames are taken in any order, and kept until their axis is whole; it is then decoded in one pass over its frames
 (`pmp_axis`), so that what is left after a scan's last frame is one pass. A pixel whose fringe order is not nearly
 certain, and not plain from its neighbours, stays undecided. How noisy the pixels are is taken from the capture itself:
-from the residual of the fit where a set has four shifts or more, else from how well neighbouring rungs agree.
+from the residual of the fit where a set has four shifts or more, else from how well neighbouring rungs agree. A frame
+that shows what another one of its set shows is left out, and named (`doubled`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from scanner.decode import Coordinates, Decoded, Reason, neighbours, one_surface
 from scanner.decode.agreement import disagreements, doubtful_counts
+from scanner.decode.doubled import doubled_frames, may_be_doubled
 from scanner.decode.frames import FrameCheck
 from scanner.decode.lone_set import require_fringes
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps
@@ -64,6 +66,7 @@ class PmpDecoder:
         self._copies: NDArray[Any] | None = None
         self._maps = {axis: AxisMaps.empty(camera.width * camera.height) for axis in self._pattern.axes}
         self._found: dict[Axis, AxisFound] = {}
+        self._doubled: list[str] = []
 
     @property
     def camera(self) -> CameraFormat:
@@ -113,7 +116,7 @@ class PmpDecoder:
             if found.ripple is not None and (ripple := found.ripple.warning(axis, found.light)) is not None:
                 warnings += (ripple,)
         warnings += self._found[self._pattern.axes[0]].ladder.warnings()
-        return self._decoded(warnings)
+        return self._decoded((*self._doubled, *warnings))
 
     def coordinates(self) -> Coordinates:
         """In place of `finish`: the same coordinates and confidence, in less time.
@@ -163,7 +166,27 @@ class PmpDecoder:
         return tuple(warnings)
 
     def _decode(self, axis: Axis) -> None:
-        self._found[axis] = self._decoded_axis(axis, brief=False)
+        found = self._decoded_axis(axis, brief=False)
+        self._found[axis] = self._decoded_axis(axis, brief=False) if self._without_doubled(axis, found) else found
+
+    def _without_doubled(self, axis: Axis, found: AxisFound) -> bool:
+        """Leave doubled frames out, and keep what is to be said of them; whether any was left out."""
+        frames, clip = axis_frames(self._pattern, axis, self._frames), self._thresholds.clip(self._camera)
+        if not may_be_doubled(found.noise, found.maps.albedo, found.maps.modulation, frames):
+            return False
+        before = len(self._frames)
+        for k, s in enumerate(s for s in self._pattern.sets() if s.axis == axis):
+            for one in doubled_frames(frames, k, self._camera.shape, clip):
+                positions = [self._sequence.fringes[s.first + n] for n in one.true]
+                told = f"frequency {s.frequency:g} along {axis}: "
+                if one.false is None:
+                    told += f"frames {' and '.join(map(str, positions))} show the same: the set is out of step"
+                else:
+                    false = self._sequence.fringes[s.first + one.false]
+                    told += f"frame {false} shows what frame {positions[0]} shows, and was left out"
+                    self._frames.pop(s.first + one.false, None)
+                self._doubled.append(f"{told}; capture again")
+        return len(self._frames) < before
 
     def _decoded_axis(self, axis: Axis, brief: bool) -> AxisFound:
         frames = axis_frames(self._pattern, axis, self._frames)

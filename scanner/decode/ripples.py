@@ -122,6 +122,8 @@ def _by_set(
 ) -> dict[int, _Told]:
     """What all steps together tell of each harmed set: least squares, each step weighted by its noise."""
     harmed = [k for k, n in enumerate(shifts) if 3 <= n < FEWEST_SHIFTS_UNHARMED and np.any(ladder.errors[:, k] != 0)]
+    if not harmed:  # as where one set lost a frame, and the others have many shifts
+        return {}
     width = 2 * len(harmed)
     normal, right = np.zeros((width, width)), np.zeros(width)
     spreads: list[float] = []
@@ -140,7 +142,7 @@ def _by_set(
         spreads.append(max(float(np.std(values)), 1e-9))
         normal += design.T @ design / spreads[-1] ** 2
         right += design.T @ values / spreads[-1] ** 2
-    if not harmed or not np.isfinite(spreads).any():
+    if not np.isfinite(spreads).any():
         return {}
     covariance = np.linalg.pinv(normal)
     solved, noise = covariance @ right, np.diag(covariance)
