@@ -63,7 +63,7 @@ class Client:
 
         Args:
             endpoint: the daemon's control endpoint, ipc.
-            timeout_s: how long an answer may take.
+            timeout_s: how long an answer may take; at least 90 s of calls that wait for devices.
             name: who asks; a repeated job_id means the same job only from the same name.
 
         Raises:
@@ -309,7 +309,8 @@ class Client:
 
     def _exchange(self, call: Call) -> Any:
         number, data = self._session.request(call)
-        deadline = time.monotonic() + self.timeout_s
+        patience_s = call.patience_s(self.timeout_s)
+        deadline = time.monotonic() + patience_s
         send(self._control, data)
         resend_at = time.monotonic() + RESEND_S
         while (now := time.monotonic()) < deadline:
@@ -328,7 +329,7 @@ class Client:
             if isinstance(outcome, ScannerError):
                 raise outcome
             return outcome
-        raise unreachable(self.endpoint, f"{call.method} was not answered within {self.timeout_s:g} s")
+        raise unreachable(self.endpoint, f"{call.method} was not answered within {patience_s:g} s")
 
     def _exchange_all(self, calls: tuple[Call, ...]) -> list[Any]:
         """Several calls at once: while one answer is on its way the next is being made."""

@@ -261,7 +261,8 @@ class AsyncClient:
 
     async def _exchange(self, call: Call) -> Any:
         number, data = self._session.request(call)
-        deadline = time.monotonic() + self.timeout_s
+        patience_s = call.patience_s(self.timeout_s)
+        deadline = time.monotonic() + patience_s
         try:
             while (left := deadline - time.monotonic()) > 0:
                 answer = self._answers[number] = asyncio.get_running_loop().create_future()
@@ -278,7 +279,7 @@ class AsyncClient:
                 return outcome
         finally:
             self._answers.pop(number, None)
-        raise unreachable(self.endpoint, f"{call.method} was not answered within {self.timeout_s:g} s")
+        raise unreachable(self.endpoint, f"{call.method} was not answered within {patience_s:g} s")
 
     async def _read_answers(self) -> None:
         while True:

@@ -40,6 +40,11 @@ RESEND_S = 2.0
 """A call without an answer is sent again after this long: every method may be repeated (job_id), and a daemon that
 was restarted has lost what was on its way to the old one."""
 
+DEVICES_S = 90.0
+"""How long calls may take that wait for devices: these are opened, and looked for by every driver (protocol.md)"""
+
+WAIT_FOR_DEVICES = frozenset({"devices.list", "live.stop", "preview.start"})
+
 QUIET_S = 2.0
 """After this long without an event the client asks for the job's state."""
 
@@ -59,6 +64,10 @@ class Call:
 
     method: str
     params: Mapping[str, Any] = field(default_factory=dict)
+
+    def patience_s(self, timeout_s: float) -> float:
+        """How long its answer is waited for by a client that gives others `timeout_s`."""
+        return max(timeout_s, DEVICES_S) if self.method in WAIT_FOR_DEVICES else timeout_s
 
 
 _T = TypeVar("_T")
