@@ -31,7 +31,7 @@ def raise_if_empty(decoded: Decoded) -> None:
     """Raise where no pixel at all has a value: an empty cloud is no success.
 
     Raises:
-        DecodeError: with the reasons that dominate, and what to do about the first of them.
+        DecodeError: with the reasons that dominate, what the decoder warned of, and what to do about the first of them.
     """
     if decoded.reason.size == 0 or (decoded.reason == Reason.VALUE).any():
         return
@@ -41,7 +41,8 @@ def raise_if_empty(decoded: Decoded) -> None:
     order = [Reason(int(i)) for i in np.argsort(-lit if lit.any() else -counts, kind="stable")]
     first = order[0]
     named = ", ".join(f"{counts[r]:,} {_IN_WORDS[r]}" for r in sorted(_IN_WORDS, key=lambda r: -counts[r]) if counts[r])
+    remedy = _REMEDIES.get(first, "look at the order of the frames with fringed audit, and capture again")
     raise DecodeError(
         f"no pixel could be decoded although the scene is lit: of {int(counts.sum()):,} pixels {named}",
-        hint=_REMEDIES.get(first, "look at the order of the frames with fringed audit, and capture again"),
+        hint="; ".join([*decoded.warnings, remedy]),
     )

@@ -1,8 +1,9 @@
 """Decoding Gray and binary code, with inverses or with white and black, along one axis or both.
 
 The position is the centre of the cell that the projected bits name (formats.md). A pixel on the border of two cells
-leaves one bit open; where both values name neighbouring cells it is decided all the same, everywhere else an open bit
-leaves the pixel undecided. Frames are kept and decoded in one pass over all of them.
+leaves one bit open, blur one or two; where all that they could mean are cells close by, the position is the middle of
+these, and its sigma as wide as they are. Everywhere else an open bit leaves the pixel undecided. Frames are kept and
+decoded in one pass over all of them.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from scanner.decode import Coordinates, Decoded, Map, Reason
 from scanner.decode.addresses import addresses_of, maps_to_fill
 from scanner.decode.frames import FrameCheck
 from scanner.decode.graycode_bits import BOTH, INVERSE, PLAIN
+from scanner.decode.graycode_blur import blurred_bits, shares_decided
 from scanner.decode.graycode_kernels import decode_codes, gather
 from scanner.decode.noise import ROUNDING_VARIANCE, default_noise
 from scanner.decode.reasons import REASONS
@@ -49,7 +51,8 @@ class GrayThresholds:
     decisive_sigmas: float = 3.5
     """the same difference over its noise; below it the bit is open"""
     max_open_cells: int = 3
-    """cells that a pixel's open bits may span, two bits at most: 1 is the border of two cells, 3 two blurred bits"""
+    """from the first to the last cell that a pixel's open bits leave, two bits at most: 1 is the border of two cells, 3
+    two blurred bits"""
     min_code_probability: float = 0.999
     """probability that every bit is right that matters"""
 
@@ -163,7 +166,15 @@ class GrayDecoder:
 
     def _judged(self) -> tuple[_Codes, tuple[str, ...], float]:
         codes = self._codes()
-        return codes, self._check_complete(codes), self._noise_factor(codes)
+        warnings, factor = self._check_complete(codes), self._noise_factor(codes)
+        return codes, (*warnings, *self._blurred(codes, factor)), factor
+
+    def _blurred(self, codes: _Codes, factor: float) -> tuple[str, ...]:
+        noise, t = default_noise(self._camera.max_value), self._thresholds
+        shares = shares_decided(
+            codes.addresses, codes.levels, codes.like, self._pixels, noise, factor, t.decisive_share, t.decisive_sigmas
+        )
+        return tuple(blurred_bits(self._pattern, shares))
 
     # --- frames -------------------------------------------------------------------------------------------------
 

@@ -93,9 +93,11 @@ def read_bits(
 
 @inlined_kernel
 def value_and_spread(code: Lanes, unsure: Lanes, gray: bool) -> tuple[Lanes, Lanes]:
-    """The cell that the word names, and the largest distance in cells to what it means with its open bits turned.
+    """The middle of the cells that the word names, whatever its open bits are, and from the first to the last of them.
 
-    More than two open bits give a spread beyond any limit.
+    Any of them is as likely as the others: read as it happens to be, an open bit would name the first one or the last
+    as often as those between. In cells, the middle in whole or half ones. More than two open bits give a spread beyond
+    any limit.
     """
     here = _cell(code, gray)
     value, spread = floats(here), floats(np.float32(0))
@@ -105,7 +107,8 @@ def value_and_spread(code: Lanes, unsure: Lanes, gray: bool) -> tuple[Lanes, Lan
         low, both = _cell(code ^ (unsure ^ high), gray), _cell(code ^ unsure, gray)
         # Turning a bit of a Gray word turns all bits of the value below it: values are linear in words.
         alone = (here ^ low) ^ both
-        spread = greatest(_apart(low, here), greatest(_apart(both, here), _apart(alone, here)))
+        first, last = least(least(here, low), least(both, alone)), greatest(greatest(here, low), greatest(both, alone))
+        value, spread = floats(first + last) * np.float32(0.5), floats(last - first)
         spread = choose(word(high & (high - 1)) > 0, np.float32(1e6), spread)
     return value, spread
 
@@ -118,8 +121,3 @@ def _cell(code: Lanes, gray: bool) -> Lanes:
         code = code ^ (code >> 2)
         code = code ^ (code >> 1)
     return word(code)
-
-
-@inlined_kernel
-def _apart(one: Lanes, two: Lanes) -> Lanes:
-    return floats(greatest(one - two, two - one))

@@ -95,7 +95,7 @@ def decode_codes(
         gray: Gray code, else binary. shift: code bits that were not projected. sizes: (A,) projector pixels an axis.
         noise: [variance at level 0, variance per level, least variance, factor].
         limits: [contrast in levels, contrast in sigmas squared, decisive share of the contrast, decisive sigmas
-            squared, wrong-bit probability, cells that open bits may span, largest grey level].
+            squared, wrong-bit probability, cells from the first to the last that open bits leave, largest grey level].
         brief: write positions, confidence and reason alone.
         maps: (2 A + 3, P + up to LANES) float32 whose rows begin with a cache line; positions, sigmas, confidence,
             albedo, modulation. reason: (P + up to LANES,) uint8. Both are written up to a multiple of LANES.

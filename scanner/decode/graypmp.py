@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Reason
 from scanner.decode.frames import FrameCheck
-from scanner.decode.graycode import GrayDecoder
+from scanner.decode.graycode import GrayDecoder, GrayThresholds
 from scanner.decode.phase_and_code import PhaseAndCode, compare_phase_and_code, require_code_order
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps
 from scanner.decode.pmp_frames import axis_frames
@@ -140,7 +140,11 @@ class GrayPmpDecoder:
             for position, sign in ((part.total - 2, 1), (part.total - 1, -1)):
                 level = np.clip(light.albedo + sign * contrast, 0, self._camera.max_value)
                 frames[position] = np.rint(level).astype(self._camera.dtype).reshape(self._camera.shape)
-        decoder = GrayDecoder(part, self._camera, threads=self._threads)
+        # Cells beyond one fringe name two, between which the phase does not choose.
+        of_fringe = self._sequence.projector.along(self._pattern.axes[0]) / self._pattern.pmp.frequencies[0]
+        together = max(round(of_fringe / self._pattern.cell_px) - 1, 1)
+        thresholds = GrayThresholds(max_open_cells=min(together, GrayThresholds.max_open_cells))
+        decoder = GrayDecoder(part, self._camera, thresholds, self._threads)
         for position, frame in frames.items():
             decoder.keep(position, frame)
         return decoder.finish()

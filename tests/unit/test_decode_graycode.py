@@ -147,8 +147,54 @@ def test_the_border_of_two_cells_is_decided_and_nothing_else_is_between():
         frames.append((position, np.rint(np.clip(grey, 0, 255)).astype(np.uint8)))
     found = decode(sequence, frames, camera)
     assert np.isfinite(found.columns).mean() > 0.99
-    assert np.nanmax(np.abs(found.columns - (at + 0.5))) <= 2
+    # A cell is two pixels wide: those between two cells see the border, and all others the middle of theirs.
+    np.testing.assert_allclose(found.columns, at + 0.5, atol=1e-4)
     assert np.nanmax(found.sigma_columns) > 2 / np.sqrt(12)
+
+
+def blurred(sequence, sigma_px, pixels=4000):
+    """Frames of a board seen through a projector out of focus: columns at 40 rows of `pixels`, and the camera."""
+    camera = CameraFormat(pixels, 40)
+    at = np.linspace(5, 310, pixels)
+    weights = np.exp(-0.5 * ((np.arange(321) - at[:, None]) / sigma_px) ** 2)
+    rng, frames = np.random.default_rng(2), []
+    for position in range(len(sequence)):
+        light = np.append(sequence.light(position)[0], 0)
+        grey = 10 + 200 * (weights @ light) / weights.sum(axis=1) + rng.normal(size=camera.shape)
+        frames.append((position, np.rint(np.clip(grey, 0, 255)).astype(np.uint8)))
+    return np.broadcast_to(at, camera.shape), frames, camera
+
+
+@pytest.mark.parametrize(
+    ("code", "sigma_px", "gone", "share"),
+    [
+        ("gray", 0.4, 0, 1.0),
+        ("gray", 2.0, 1, 0.99),
+        ("gray", 4.0, 2, 0.4),
+        ("binary", 2.0, 2, 0.6),
+        ("gray", 6.0, 3, 0),
+    ],
+)
+def test_what_blur_leaves_of_the_code_is_coarse_undecided_and_said(code, sigma_px, gone, share):
+    sequence = sequence_of(GrayPattern(("x",), 9, 9, code=code, inverse=False))
+    truth, frames, camera = blurred(sequence, sigma_px)
+    found = decode(sequence, frames, camera)
+    off = np.abs(found.columns - truth)[np.isfinite(found.columns)] if share else np.zeros(1)
+    assert np.isfinite(found.columns).mean() >= share
+    # No further than the ends of the cells that are left, whose sigma is an even distribution's; 20 levels decide.
+    assert (off <= 0.1 + np.sqrt(3) * found.sigma_columns[np.isfinite(found.columns)]).all() or not share
+    assert np.nanmax(off) <= 2.1
+    assert len(found.warnings) == (gone > 0)
+    if gone:
+        finest = "finest bit along x shows" if gone == 1 else f"{gone} finest bits along x show"
+        assert found.warnings[0].startswith("out of focus")
+        assert finest in found.warnings[0]
+        assert f"--bits {9 - gone}" in found.warnings[0]
+
+
+def test_pixels_too_dim_to_tell_accuse_no_blur():
+    sequence = sequence_of(GrayPattern(("x",), 9, 9, inverse=False))
+    assert decode(sequence, take(sequence, albedo=0.1)).warnings == ()
 
 
 def test_shadow_clipped_and_beyond_the_projector_have_their_reasons():
