@@ -24,6 +24,11 @@ from scanner.sequencer.fringe_fit import MIN_PIXELS, Fit, mean_vector
 LEAST_OFFSET = 0.05
 """Mean remainder, in fringes, that is allowed in any case: interreflections and slow drift of the lamp."""
 
+MOST_OF_ENDS = 5.0
+"""Fringes, over how much of the field a set must be seen, or over half of it if that is less. Blur that takes a set
+(a sigma of .6 fringes leaves .1 % of it) still leaves light that swings at both ends of the field, where a fringe has
+no neighbour: strips of two sigmas, 2.4 fringes together, whose phases are anything; twice that where a part is seen."""
+
 HYPOTHESIS_GAIN = 0.35
 """A turned set is believed when it makes the remainders agree by so much better (mean cosine)."""
 
@@ -65,6 +70,13 @@ def order_witnesses(
         return []
     if suspected & {p for fit in fits for p in fit.positions}:
         # Phases of a set with a foreign frame prove nothing against other sets.
+        return []
+    seen = np.array([np.count_nonzero(pixels) for _, pixels in bright])
+    least = np.array([min(MOST_OF_ENDS / fit.fringe_set.frequency, 0.5) for fit in fits]) * seen.max()
+    if taken := [
+        f"{fit.fringe_set.frequency:g}" for fit, has, needs in zip(fits, seen, least, strict=True) if has < needs
+    ]:
+        cannot.append(f"rotations and reversals of sets along {axis} (frequency {' and '.join(taken)} is blurred away)")
         return []
     use = np.logical_and.reduce([pixels for _, pixels in bright])
     if np.count_nonzero(use) < MIN_PIXELS:

@@ -79,6 +79,15 @@ def test_hard_conditions_are_not_disorder(scene: str, conditions: dict[str, obje
         assert capture.acquisition.retakes == 0
 
 
+def test_fringes_that_blur_has_taken_testify_nothing() -> None:
+    # What swings at the ends of the field then is no fringe: its phases have nothing to do with the other sets'.
+    sequence = PatternSequence.bracketed(QUICK, PmpPattern(frequencies=(1, 5, 30), shifts=(8, 8, 8)))
+    found = take(sequence, exposure_ns=12_500_001, scene="bust", faults="projector_blur_sigma_px=4").acquisition
+    assert found.witnesses.passed, found.witnesses.items
+    assert found.retakes == 0
+    assert any("frequency 30 is blurred away" in text for text in found.witnesses.cannot_reveal)
+
+
 @pytest.mark.parametrize("pattern", list(PATTERNS))
 def test_an_uncorrected_gamma_is_not_disorder(pattern: str) -> None:
     bent = PATTERNS[pattern].pattern
