@@ -35,8 +35,15 @@ SMOOTH = np.float32(0.25)
 ORDERS = 7
 """Orders of a surface that are told apart, -3 .. 3 from its first pixel's; those beyond count as the outermost."""
 
+LEAST_BORDER = 16
+"""Pairs of pixels along the border of two regions from which on it tells whether they are one surface: noisy pixels,
+which belong to neither, touch both. A wrong patch with a shorter one is no larger than four pixels by four."""
+
 CLEAR = np.float32(2.0)
 """Votes of the order that is right over those of all others."""
+
+NOWHERE, BROKEN = 99, 98
+"""In place of a jump: no such pair of pixels; a pair over which no surface runs on."""
 
 _VALUE, _RISK = np.uint8(Reason.VALUE), np.uint8(Reason.UNWRAP_RISK)
 
@@ -92,16 +99,45 @@ def doubt_wrong_orders(cycles: Map, coarse: Map, confidence: Map, reason: NDArra
     Returns:
         How many lost their value.
     """
-    parent = np.arange(cycles.size, dtype=np.int32)
-    jump = np.zeros(cycles.size, np.int16)
+    parent, jump = np.arange(cycles.size, dtype=np.int32), np.zeros(cycles.size, np.int16)
     _join(cycles, coarse, reason, width, parent, jump)
+    borders = _borders(cycles, coarse, reason, width, parent, jump)
+    _join_regions(*_crossed(borders, cycles.size), parent, jump)
     return _doubt(cycles, coarse, confidence, reason, parent, jump)
+
+
+def _crossed(borders: NDArray[np.int32], pixels: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Regions, others, and the jumps from these to those, of the borders over which the surface runs on.
+
+    Args:
+        borders: of `_borders`. pixels: of the image.
+    """
+    pairs, at = np.unique(borders[:, 0] * np.int64(pixels) + borders[:, 1], return_inverse=True)
+    length = np.bincount(at, minlength=pairs.size)
+    # For and against: most of all pairs, those over which nothing runs on included.
+    up, down = (2 * np.bincount(at[borders[:, 2] == way], minlength=pairs.size) > length for way in (1, -1))
+    told = (up | down) & (length >= LEAST_BORDER)
+    return pairs[told] // pixels, pairs[told] % pixels, np.where(up, 1, -1)[told]
 
 
 def warm_up() -> None:
     """Compile what only scans of hollows come to."""
     cycles, coarse, confidence = np.zeros((3, 4), np.float32)
     doubt_wrong_orders(cycles, coarse, confidence, np.zeros(4, np.uint8), 2)
+
+
+@kernel
+def _step(cycles: Map, coarse: Map, reason: NDArray[np.uint8], width: int, here: int, there: int) -> int:
+    """The jump of order to a pixel right or below; BROKEN if no surface runs on to it, NOWHERE if none is known."""
+    if there >= cycles.size or (there == here + 1 and there % width == 0):
+        return NOWHERE
+    if (reason[here] != _VALUE and reason[here] != _RISK) or (reason[there] != _VALUE and reason[there] != _RISK):
+        return NOWHERE
+    apart = cycles[there] - cycles[here]
+    whole = np.float32(np.rint(apart))
+    if abs(whole) > 1 or abs(apart - whole) > SMOOTH or abs(coarse[there] - coarse[here]) > SMOOTH:
+        return BROKEN
+    return int(whole)
 
 
 @kernel
@@ -113,24 +149,60 @@ def _join(
     parent: NDArray[np.int32],
     jump: NDArray[np.int16],
 ) -> None:
-    """Join pixels with those to the right and below. parent: each one's surface; jump: its order over its parent's."""
+    """Join pixels into regions of one order. parent: towards each one's first pixel. jump: zeros yet."""
     for here in range(cycles.size):
-        if reason[here] != _VALUE and reason[here] != _RISK:
-            continue
         for there in (here + 1, here + width):
-            if there >= cycles.size or (there == here + 1 and there % width == 0):
-                continue
-            if reason[there] != _VALUE and reason[there] != _RISK:
-                continue
-            apart = cycles[there] - cycles[here]
-            whole = np.float32(np.rint(apart))
-            if abs(whole) > 1 or abs(apart - whole) > SMOOTH or abs(coarse[there] - coarse[here]) > SMOOTH:
-                continue
-            one, mine = _surface(parent, jump, here)
-            other, its = _surface(parent, jump, there)
-            if one != other:
-                parent[other] = one
-                jump[other] = mine + int(whole) - its
+            if _step(cycles, coarse, reason, width, here, there) == 0:
+                one, other = _surface(parent, jump, here)[0], _surface(parent, jump, there)[0]
+                if one != other:
+                    parent[other] = one
+
+
+@kernel
+def _borders(
+    cycles: Map,
+    coarse: Map,
+    reason: NDArray[np.uint8],
+    width: int,
+    parent: NDArray[np.int32],
+    jump: NDArray[np.int16],
+) -> NDArray[np.int32]:
+    """(B, 3): first pixels of two regions that touch, the lower one first; jump of the second's order, 0 if broken."""
+    most = 0
+    for fill in (False, True):
+        found, count = np.empty((most, 3), np.int32), 0
+        for here in range(cycles.size):
+            for there in (here + 1, here + width):
+                step = _step(cycles, coarse, reason, width, here, there)
+                if step == NOWHERE:
+                    continue
+                one, other = _surface(parent, jump, here)[0], _surface(parent, jump, there)[0]
+                if one == other:
+                    continue
+                if fill:
+                    way = 0 if step == BROKEN else step
+                    found[count, 0], found[count, 1] = min(one, other), max(one, other)
+                    found[count, 2] = way if one < other else -way
+                count += 1
+        most = count
+    return found
+
+
+@kernel
+def _join_regions(
+    one: NDArray[np.int64],
+    other: NDArray[np.int64],
+    step: NDArray[np.int64],
+    parent: NDArray[np.int32],
+    jump: NDArray[np.int16],
+) -> None:
+    """Join regions into surfaces. jump: each pixel's order over its parent's."""
+    for i in range(one.size):
+        first, mine = _surface(parent, jump, one[i])
+        second, its = _surface(parent, jump, other[i])
+        if first != second:
+            parent[second] = first
+            jump[second] = mine + step[i] - its
 
 
 @kernel
