@@ -11,12 +11,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
+from math import atan2, hypot, pi
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from scanner.decode.noise import NoiseModel, default_noise, fit_noise
+from scanner.decode.sample_kernels import judge_steps
 from scanner.decode.unwrapping import Ladder
 
 MIN_PIXELS = 400
@@ -75,12 +78,19 @@ def agreement(
         phases: (K, n) cycles. cycles2: (K, n) expected variance of each. centre: the field's centre, fraction of it.
         floor_cycles: least systematic sigma of a set's phase.
     """
-    found = []
-    for j, remainder in enumerate(remainders_of(ladder, phases, centre)):
-        errors2 = np.asarray(ladder.errors[j] ** 2, np.float32)
-        low, high = ladder.frequencies[j : j + 2]
-        found.append(_remainder(low, high, remainder, errors2 @ cycles2, float(errors2.sum()), floor_cycles))
-    return found
+    steps = list(pairwise(ladder.frequencies.tolist()))
+    if phases.shape[1] < MIN_PIXELS:
+        return [Remainder(low, high, 0.0, floor_cycles, 0.0, 0.0, phases.shape[1]) for low, high in steps]
+    errors2 = np.asarray(ladder.errors**2, np.float32)
+    evidence = judge_steps(
+        phases, cycles2, ladder.combinations.astype(np.float64), ladder.frequencies, errors2, centre, _NOISE_BINS
+    )
+    return [
+        _remainder(
+            low, high, x.tolist(), y.tolist(), means.tolist(), float(weights.sum()), floor_cycles, phases.shape[1]
+        )
+        for (low, high), x, y, means, weights in zip(steps, *evidence, errors2, strict=True)
+    ]
 
 
 def remainders_of(ladder: Ladder, phases: NDArray[np.float32], centre: float) -> list[NDArray[np.float64]]:
@@ -161,31 +171,27 @@ def noise_of_pairs(
 def _remainder(
     low: float,
     high: float,
-    remainder: NDArray[np.float64],
-    variance: NDArray[np.float32],
+    x: list[float],
+    medians: list[float],
+    means: list[float],
     weight: float,
     least: float,
+    pixels: int,
 ) -> Remainder:
-    if remainder.size < MIN_PIXELS:
-        return Remainder(float(low), float(high), 0.0, least, 0.0, 0.0, int(remainder.size))
-    order = np.argsort(variance)[: remainder.size // _NOISE_BINS * _NOISE_BINS].reshape(_NOISE_BINS, -1)
-    middle = order.shape[1] // 2
-    x = variance[order[:, middle]]
-    medians = np.partition(np.abs(remainder).astype(np.float32)[order], middle, axis=1)[:, middle]
-    y = np.array([_sigma_of_median(float(median)) ** 2 for median in medians])
+    """x, medians, means: of `judge_steps`, one step's."""
+    y = [_sigma_of_median(median) ** 2 for median in medians]
     # Weights 1 / y: a variance's own error grows with it.
-    rest = max(float(np.average(y - x, weights=1 / np.maximum(y, 1e-12))), 0.0)
-    better = order[: _NOISE_BINS // 2].reshape(-1)
-    turns = remainder[better].astype(np.float32) * np.float32(2 * np.pi)
-    cosine, sine = float(np.cos(turns).mean()), float(np.sin(turns).mean())
+    weights = [1 / max(of_bin, 1e-12) for of_bin in y]
+    rest = sum(w * (seen - meant) for w, seen, meant in zip(weights, y, x, strict=True)) / sum(weights)
+    cosine, sine, variance = means
     return Remainder(
-        float(low),
-        float(high),
-        float(np.sqrt(variance[better[better.size // 2]])),
-        max(float(np.sqrt(rest / weight)), least),
-        float(np.arctan2(sine, cosine) / (2 * np.pi)),
-        float(np.hypot(cosine, sine)),
-        int(remainder.size),
+        low,
+        high,
+        variance**0.5,
+        max((max(rest, 0.0) / weight) ** 0.5, least),
+        atan2(sine, cosine) / (2 * pi),
+        hypot(cosine, sine),
+        pixels,
     )
 
 

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.decode.middles import middles_of_bins
+
 ROUNDING_VARIANCE = 1 / 12
 """Variance of rounding to whole grey levels; no frame is better."""
 
@@ -55,10 +57,8 @@ def fit_noise(level: NDArray[np.float32], squares: NDArray[np.float32], freedom:
     if freedom < 1 or level.size < 100:
         return default_noise(max_value)
     # As many in each bin: up to eleven of the brightest are left out.
-    order = np.argsort(level)[: level.size // _LEVELS * _LEVELS].reshape(_LEVELS, -1)
-    middle = order.shape[1] // 2
-    x = level[order[:, middle]].astype(np.float64)
-    y = np.partition(squares[order], middle, axis=1)[:, middle].astype(np.float64)
+    levels, medians, _ = middles_of_bins(level, squares, _LEVELS, True)
+    x, y = levels.astype(np.float64), medians.astype(np.float64)
     y /= freedom * (1 - 2 / (9 * freedom)) ** 3
     # A variance's own error grows with it: weights 1 / y, one round of which is enough for two parameters.
     w = 1 / np.maximum(y, ROUNDING_VARIANCE)

@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode.agreement import PAIR_DISTANCE, Remainder, agreement, noise_of_pairs
-from scanner.decode.noise import NoiseModel, default_noise, fit_noise
+from scanner.decode.middles import nth_of
+from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel, default_noise, fit_noise
 from scanner.decode.pmp_frames import AxisFrames
 from scanner.decode.pmp_sums import fit_runs
 from scanner.decode.runs import runs_of, spread_runs
+from scanner.decode.sample_kernels import count_lit, mark_good, take_good
 from scanner.decode.unwrapping import Ladder
 
 SIZE = 4096
@@ -63,7 +65,7 @@ class Sample:
     def brightest(self, finest: int) -> float:
         """99th percentile of the finest set's modulation, grey levels."""
         b = self.modulations[finest].reshape(-1)
-        return float(np.partition(b, at := int(0.99 * (b.size - 1)))[at])
+        return float(nth_of(b, int(0.99 * (b.size - 1))))
 
     def noise(self, ladder: Ladder, centre: float, least: float, sigmas: float) -> NoiseModel:
         """The scan's noise model, from residuals; where fits leave none (three shifts), from pairs of pixels.
@@ -89,19 +91,14 @@ class Sample:
 
     def judged(self, noise: NoiseModel, least: float, sigmas: float) -> Judged:
         """The `good` ones."""
-        enough, cycles2, modulations2 = self._enough(noise, least, sigmas)
         sets = len(self.gains)
-        phases = self.phases.reshape(sets, -1)
-        cycles2 /= modulations2
-        good = np.flatnonzero(enough)
-        cycles2 = cycles2.reshape(sets, -1)
-        if good.size < enough.size:
-            phases, cycles2 = phases.take(good, axis=1), cycles2.take(good, axis=1)
-        return Judged(phases, cycles2)
+        good, variance, count = self._marked(noise, least, sigmas)
+        phases, modulations = self.phases.reshape(sets, -1), self.modulations.reshape(sets, -1)
+        return Judged(*take_good(phases, modulations, variance, self.gains, good, count))
 
     def good(self, noise: NoiseModel, least: float, sigmas: float) -> NDArray[np.bool_]:
         """(R, L) bool: pixels not clipped whose sets all have `least` modulation, and `sigmas` times its noise."""
-        return self._enough(noise, least, sigmas)[0]
+        return self._marked(noise, least, sigmas)[0].reshape(self.mean.shape)
 
     def overtone_share2(self, finest: int) -> float:
         """Mean square that overtones leave at the worst phase, over the finest set's B^2 of a typical pixel."""
@@ -112,22 +109,21 @@ class Sample:
 
     def lit(self, least: float, sigmas: float) -> NDArray[np.bool_]:
         """The same before anything is known of the noise: by that of any camera, whatever the residuals."""
-        noise = self.gains[:, None, None] * default_noise(self.max_value).variance(self.mean)
-        enough = np.maximum(np.float32(sigmas**2) * noise, np.float32(max(least**2, 1e-12)))
-        return np.asarray((self.modulations**2 > enough).all(axis=0) & self.usable)
+        return self._marked(default_noise(self.max_value), least, sigmas, trusting=False)[0].reshape(self.mean.shape)
 
-    def _enough(
-        self, noise: NoiseModel, least: float, sigmas: float
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
-        # Which are good; variance of B over (2 pi)^2, and B^2. The plain form of what the kernel does.
-        model = noise.variance(self.mean)
-        own = (np.float32(self.prior) * model + self.residual) / np.float32(self.prior + self.freedom)
-        variance = self.gains[:, None, None] * np.maximum(own, model, out=own)
-        modulations2 = self.modulations * self.modulations
-        enough = np.maximum(np.float32(sigmas**2) * variance, np.float32(max(least**2, 1e-12)))
-        good = (modulations2 > enough).all(axis=0) & self.usable
-        variance *= np.float32(1 / (4 * np.pi**2))
-        return np.asarray(good), np.asarray(variance, np.float32), modulations2
+    def _marked(
+        self, noise: NoiseModel, least: float, sigmas: float, trusting: bool = True
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float32], int]:
+        """(n,) which are good, (n,) variance of one sample, and how many are. trusting: residuals count."""
+        weights = (self.prior, self.freedom, 1) if trusting else (1, 0, 0)
+        good, variance = np.empty(self.mean.size, np.bool_), np.empty(self.mean.size, np.float32)
+        count = mark_good(
+            self.modulations.reshape(len(self.gains), -1), self.mean.reshape(-1), self.residual.reshape(-1),
+            self.usable.reshape(-1), self.gains,
+            np.array([noise.read, noise.per_level, ROUNDING_VARIANCE, *weights], np.float32),
+            np.array([sigmas**2, max(least**2, 1e-12)], np.float32), variance, good,
+        )  # fmt: skip
+        return good, variance, count
 
 
 @dataclass(frozen=True)
@@ -146,7 +142,7 @@ class Judged:
         if not self.cycles2.size:
             return float("nan")
         of_set = self.cycles2[finest]
-        return float(np.sqrt(np.partition(of_set, of_set.size // 2)[of_set.size // 2]))
+        return float(np.sqrt(nth_of(of_set, of_set.size // 2)))
 
 
 def take_sample(frames: AxisFrames, pixels: int, max_value: int, clip: int, least: float) -> Sample:
@@ -159,7 +155,8 @@ def take_sample(frames: AxisFrames, pixels: int, max_value: int, clip: int, leas
     size = SIZE if frames.freedom else PAIRS_SIZE
     while True:
         sample = _fit(frames, *runs_of(pixels, size), max_value, clip)
-        lit = np.count_nonzero((sample.modulations > least).all(axis=0) & sample.usable)
+        modulations = sample.modulations.reshape(len(frames.gains), -1)
+        lit = count_lit(modulations, sample.usable.reshape(-1), np.float32(least))
         if lit >= ENOUGH or size >= pixels:
             return sample
         size *= _GROWTH

@@ -1,0 +1,111 @@
+"""What is judged of a PMP scan's sample in kernels, against the same in plain NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scanner.decode.agreement import agreement, remainders_of
+from scanner.decode.middles import middle_of_squares, middles_of_bins, nth_of, order_of
+from scanner.decode.noise import NoiseModel
+from scanner.decode.pmp_sample import Sample
+from scanner.decode.unwrapping import plan_ladder
+
+BINS = 8
+
+
+def numbers(size, seed=0, steps=24):
+    """Of both signs, with many equal ones, as means of whole grey levels are."""
+    drawn = np.random.default_rng(seed).normal(20, 30, size)
+    return (np.rint(drawn * steps) / steps).astype(np.float32)
+
+
+@pytest.mark.parametrize("size", [33, 4096, 5001])
+def test_numbers_come_in_their_order_and_equal_ones_as_they_were(size):
+    keys = numbers(size)
+    order = order_of(keys)
+    assert np.array_equal(order, np.argsort(keys, kind="stable"))
+    for n in (0, size // 3, size - 1):
+        assert nth_of(keys, n) == keys[order[n]]
+
+
+@pytest.mark.parametrize("size", [100, 4099])
+def test_medians_of_bins_are_numpys(size):
+    keys, values = numbers(size), numbers(size, seed=1)
+    x, y, order = middles_of_bins(keys, values, BINS, False)
+    bins = np.argsort(keys, kind="stable")[: size // BINS * BINS].reshape(BINS, -1)
+    middle = bins.shape[1] // 2
+    assert np.array_equal(order[: bins.size].reshape(bins.shape), bins)
+    assert np.array_equal(x, keys[bins[:, middle]])
+    assert np.array_equal(y, np.partition(values[bins], middle, axis=1)[:, middle])
+
+
+@pytest.mark.parametrize("sigma", [0.8, 1.0, 2.0])
+def test_whole_grey_levels_leave_the_noise_of_four_shifts_as_it_is(sigma):
+    levels = np.rint(np.random.default_rng(1).normal(100, sigma, (4, 30, 341)))
+    squares = ((levels[0] - levels[1] + levels[2] - levels[3]) ** 2 / 4).astype(np.float32)
+    variances = [middle_of_squares(of_bin) / (1 - 2 / 9) ** 3 for of_bin in squares]
+    assert np.mean(variances) == pytest.approx(sigma**2 + 1 / 12, rel=0.06)
+
+
+def sample(size=2048, seed=0):
+    """Of three sets, a third of whose pixels are dim, and a few of which are clipped."""
+    random = np.random.default_rng(seed)
+    mean = random.uniform(10, 200, size).astype(np.float32)
+    height = mean * random.choice([0.6, 0.02, 0.9], size)
+    cycles = random.uniform(0.1, 0.9, size)
+    noise = random.normal(0, 0.01, (3, size))
+    phases = (np.array([1, 8, 64])[:, None] * cycles + noise + 0.5) % 1 - 0.5
+    return Sample(
+        phases.astype(np.float32).reshape(3, -1, 64),
+        (height * random.uniform(0.8, 1, (3, size))).astype(np.float32).reshape(3, -1, 64),
+        mean.reshape(-1, 64),
+        (4 * random.chisquare(15, size)).astype(np.float32).reshape(-1, 64),
+        (random.uniform(size=size) > 0.05).reshape(-1, 64),
+        np.full(3, 0.25, np.float32),
+        15,
+        255,
+        np.arange(0, size, 64),
+    )
+
+
+def test_good_pixels_are_those_of_the_plain_form():
+    noise, least, sigmas = NoiseModel(1.5, 0.02, measured=True), 3.0, 7.0
+    drawn = sample()
+    judged = drawn.judged(noise, least, sigmas)
+
+    model = noise.variance(drawn.mean)
+    own = (np.float32(drawn.prior) * model + drawn.residual) / np.float32(drawn.prior + drawn.freedom)
+    variance = drawn.gains[:, None, None] * np.maximum(own, model)
+    enough = np.maximum(np.float32(sigmas**2) * variance, np.float32(least**2))
+    good = (drawn.modulations**2 > enough).all(axis=0) & drawn.usable
+    assert 500 < np.count_nonzero(good) < 1900
+    assert np.array_equal(drawn.good(noise, least, sigmas), good)
+    assert np.array_equal(judged.phases, drawn.phases[:, good])
+    cycles2 = (variance / np.float32(4 * np.pi**2))[:, good] / drawn.modulations[:, good] ** 2
+    assert np.allclose(judged.cycles2, cycles2, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("frequencies", [(1, 8, 64), (59, 64, 70)])
+def test_steps_are_judged_as_in_the_plain_form(frequencies):
+    random = np.random.default_rng(3)
+    ladder = plan_ladder(frequencies, [0.25] * 3)
+    cycles2 = random.uniform(1e-5, 1e-4, (3, 3001)).astype(np.float32)
+    seen = np.array(frequencies)[:, None] * random.uniform(0.1, 0.9, 3001) + random.normal(0, np.sqrt(cycles2) * 1.5)
+    phases = ((seen + 0.5) % 1 - 0.5).astype(np.float32)
+    found = agreement(ladder, phases, cycles2, 0.5, 0.0)
+
+    for j, remainder in enumerate(remainders_of(ladder, phases, 0.5)):
+        errors2 = (ladder.errors[j] ** 2).astype(np.float32)
+        variance = errors2 @ cycles2
+        bins = np.argsort(variance, kind="stable")[: variance.size // BINS * BINS].reshape(BINS, -1)
+        middle = bins.shape[1] // 2
+        y = (np.median(np.abs(remainder)[bins], axis=1) / 0.6745) ** 2
+        rest = np.average(y - variance[bins[:, middle]], weights=1 / y)
+        better = bins[: BINS // 2].reshape(-1)
+        mean = np.exp(2j * np.pi * remainder[better]).mean()
+        assert found[j].expected_sigma == pytest.approx(np.sqrt(variance[better[better.size // 2]]), rel=1e-5)
+        assert found[j].systematic == pytest.approx(np.sqrt(rest / errors2.sum()), rel=0.02)
+        assert found[j].agreement == pytest.approx(abs(mean), abs=1e-6)
+        assert found[j].offset == pytest.approx(np.angle(mean) / (2 * np.pi), abs=1e-6)
+    assert len(found) == len(ladder.errors) > 1
