@@ -23,8 +23,10 @@ from scanner.lanes import (
     floats,
     greatest,
     least,
+    load,
     magnitude,
     multiply_add,
+    root,
     samples,
     store,
     with_sign,
@@ -32,6 +34,9 @@ from scanner.lanes import (
 
 GROUP = 4
 """Sets are padded to whole groups of frames, with frames of weight 0."""
+
+RUNS_AHEAD = 4
+"""Runs of a sample that are asked for before they are worked on: work on one is much shorter than the wait for it."""
 
 ARCTAN_ERROR_CYCLES = 3.5e-7
 """Largest error of `_phase`: a third of what rounding to 16 bits leaves of three shifts that fill the range, and a
@@ -88,11 +93,11 @@ def fit_runs(
     turns = turns_of(starts, weights, whole)
     spot = aligned_rows(2 * sets + 3, LANES).reshape(-1)
     spare = np.zeros((addresses.size, LANES), like.dtype)
+    flat_phases, flat_modulations = phases.reshape(-1), modulations.reshape(-1)
+    for r in range(RUNS_AHEAD):
+        _expect_run(addresses, like, runs, r, length)
     for r in range(runs.size):
-        if r + 1 < runs.size:
-            for n in range(addresses.size):
-                expect(addresses, n, runs[r + 1], like)
-                expect(addresses, n, runs[r + 1] + length - 1, like)
+        _expect_run(addresses, like, runs, r + RUNS_AHEAD, length)
         for done in range(0, length, LANES):
             at, size = runs[r] + done, min(LANES, length - done)
             # The last vector may end with the frame, but not lie beyond it.
@@ -103,10 +108,19 @@ def fit_runs(
             else:
                 near = addresses
             a, rest, top = fit_lanes(near, like, starts, weights, grams, whole, turns, begin, spot)
+            to, skip = r * length + done, at - begin
+            store(spot, (2 * sets + 2) * LANES, floats(top))
+            for i in range(size):
+                clipped[to + i] = spot[(2 * sets + 2) * LANES + skip + i] >= clip
+            if size == LANES and skip == 0:
+                for k in range(sets):
+                    store(flat_phases, k * mean.size + to, load(spot, k * LANES))
+                    store(flat_modulations, k * mean.size + to, root(load(spot, (sets + k) * LANES)))
+                store(mean, to, a)
+                store(residual, to, rest)
+                continue
             store(spot, 2 * sets * LANES, a)
             store(spot, (2 * sets + 1) * LANES, rest)
-            store(spot, (2 * sets + 2) * LANES, floats(top))
-            to, skip = r * length + done, at - begin
             for k in range(sets):
                 for i in range(size):
                     phases[k, to + i] = spot[k * LANES + skip + i]
@@ -114,7 +128,15 @@ def fit_runs(
             for i in range(size):
                 mean[to + i] = spot[2 * sets * LANES + skip + i]
                 residual[to + i] = spot[(2 * sets + 1) * LANES + skip + i]
-                clipped[to + i] = spot[(2 * sets + 2) * LANES + skip + i] >= clip
+
+
+@inlined_kernel
+def _expect_run(addresses: NDArray[np.intp], like: NDArray[Any], runs: NDArray[np.intp], r: int, length: int) -> None:
+    """Ask for the pixels of a run, if there is one, of up to two cache lines."""
+    if r < runs.size:
+        for n in range(addresses.size):
+            expect(addresses, n, runs[r], like)
+            expect(addresses, n, runs[r] + length - 1, like)
 
 
 @contracting_kernel
