@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from math import pi, sin
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.decode.middles import nth_of
 from scanner.decode.noise import NoiseModel
 from scanner.decode.pmp_frames import AxisFrames
 
@@ -43,21 +45,20 @@ class Doubled:
 
 
 def may_be_doubled(
-    noise: NoiseModel, albedo: NDArray[np.float32], modulation: NDArray[np.float32], frames: AxisFrames
+    noise: NoiseModel, level: NDArray[np.float32], modulation: NDArray[np.float32], frames: AxisFrames
 ) -> bool:
-    """Whether residuals are large enough for a look at the frames. albedo, modulation: (P,) maps."""
-    shifts = np.array([n for n in frames.shifts if n > 3])
-    if 3 in frames.shifts or not shifts.size:
+    """Whether residuals are large enough for a look at the frames. level, modulation: (n,) of the scan's sample."""
+    shifts = [n for n in frames.shifts if n > 3]
+    if 3 in frames.shifts or not shifts:
         return 3 in frames.shifts
-    every = max(1, albedo.size // 256)
-    level, b = albedo[::every], modulation[::every]
-    lit = b > 0.25 * float(b.max(initial=0.0))
-    if not lit.any():
+    lit = modulation > 0.25 * float(modulation.max(initial=0.0))
+    level, b = level[lit], modulation[lit]
+    if not b.size:
         return False
     # The difference of two neighbours is 2 B sin(pi / N) times a sine; the fit takes three of N parts of it.
-    squares = 2 * np.sin(np.pi / shifts) ** 2 * (1 - 3 / shifts) / frames.freedom
-    seen = float(np.median(noise.variance(level[lit]))) / float(np.median(b[lit])) ** 2
-    return bool(seen > LEAST_RESIDUAL**2 * squares.min())
+    least = min(2 * sin(pi / n) ** 2 * (1 - 3 / n) for n in shifts) / frames.freedom
+    seen = float(noise.variance(np.asarray(nth_of(level, level.size // 2)))) / float(nth_of(b, b.size // 2)) ** 2
+    return seen > LEAST_RESIDUAL**2 * least
 
 
 def doubled_frames(frames: AxisFrames, k: int, shape: tuple[int, int], clip: int) -> list[Doubled]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from scanner.decode import Coordinates, Decoded, Reason, neighbours, one_surface
 from scanner.decode.agreement import disagreements, doubtful_counts
-from scanner.decode.doubled import doubled_frames, may_be_doubled
+from scanner.decode.doubled import doubled_frames
 from scanner.decode.frames import FrameCheck
 from scanner.decode.lone_set import require_fringes
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps
@@ -171,9 +171,9 @@ class PmpDecoder:
 
     def _without_doubled(self, axis: Axis, found: AxisFound) -> bool:
         """Leave doubled frames out, and keep what is to be said of them; whether any was left out."""
-        frames, clip = axis_frames(self._pattern, axis, self._frames), self._thresholds.clip(self._camera)
-        if not may_be_doubled(found.noise, found.maps.albedo, found.maps.modulation, frames):
+        if not found.may_be_doubled:
             return False
+        frames, clip = axis_frames(self._pattern, axis, self._frames), self._thresholds.clip(self._camera)
         before = len(self._frames)
         for k, s in enumerate(s for s in self._pattern.sets() if s.axis == axis):
             for one in doubled_frames(frames, k, self._camera.shape, clip):

@@ -18,6 +18,7 @@ from scanner.decode import Decoded, Map, Reason
 from scanner.decode.addresses import maps_to_fill
 from scanner.decode.agreement import MIN_PIXELS, Remainder
 from scanner.decode.cut_at_black import unmove_dark
+from scanner.decode.doubled import may_be_doubled
 from scanner.decode.neighbours import settle
 from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel
 from scanner.decode.one_surface import doubt_axis, doubtful_steps
@@ -170,6 +171,8 @@ class AxisFound:
     """median random 1-sigma of a coordinate, projector px"""
     counts: NDArray[np.int64]
     """(REASONS,) pixels by reason"""
+    may_be_doubled: bool
+    """residuals are large enough for one frame to show what another one shows; False where nobody asks"""
 
 
 def decode_axis(
@@ -257,7 +260,10 @@ def decode_axis(
         if changes.any():
             confidence[torn == Reason.OUT_OF_STEP] = 0
             counts += changes
-    return AxisFound(maps, ladder, noise, remainders, settled, off_surface, ripple, light, random_px, counts)
+    return AxisFound(
+        maps, ladder, noise, remainders, settled, off_surface, ripple, light, random_px, counts,
+        not brief and may_be_doubled(noise, sample.mean.reshape(-1), sample.modulations[finest].reshape(-1), frames),
+    )  # fmt: skip
 
 
 def _ripple(last: Remainder, weight: float, per_cycle: float, random_px: float) -> Ripple:
