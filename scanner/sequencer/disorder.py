@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from scanner.errors import DecodeError, ScannerError, SyncError
 from scanner.patterns import FrameRole, PatternSequence
-from scanner.sequencer.findings import DARK_HINT, Witnesses, listed
+from scanner.sequencer.findings import Witnesses, listed
 from scanner.sequencer.verify import FrameVerdict
 
 LIVE_HINT = (
@@ -43,7 +43,8 @@ def sync_error(
 ) -> ScannerError:
     """The error that names the frames, says what spoke against them, and what to do. said: what devices reported."""
     if witnesses.dark:
-        return DecodeError("nothing in the camera's view is lit by the projector", hint=DARK_HINT)
+        why, remedy = witnesses.why_dark
+        return DecodeError(why, hint=remedy)
     frames = sorted(set(suspects) | set(witnesses.suspects))
     if witnesses.whole:
         frames = list(range(len(sequence)))

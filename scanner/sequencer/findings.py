@@ -23,8 +23,6 @@ LIT_SHARE = 0.15
 LEAST_NOISE = 12**-0.5
 """Grey levels: rounding to whole levels."""
 
-DARK_HINT = "is the lens cap off, the projector on and awake, and the exposure long enough?"
-
 Array = NDArray[np.float32]
 
 
@@ -61,6 +59,8 @@ class Witnesses:
     cannot_reveal: tuple[str, ...] = ()
     dark: bool = False
     """nothing in view is lit by the projector: there is nothing to judge, nor to decode"""
+    why_dark: tuple[str, str] = ("", "")
+    """then: what is the matter, and what to do about it"""
 
     @property
     def suspects(self) -> tuple[int, ...]:
@@ -80,7 +80,8 @@ class Witnesses:
     def joined(self, other: Witnesses) -> Witnesses:
         """The findings of two repetitions together."""
         cannot = tuple(dict.fromkeys((*self.cannot_reveal, *other.cannot_reveal)))
-        return Witnesses((*self.items, *other.items), cannot, self.dark or other.dark)
+        why = self.why_dark if self.dark else other.why_dark
+        return Witnesses((*self.items, *other.items), cannot, self.dark or other.dark, why)
 
     def as_list(self) -> list[dict[str, Any]]:
         """Plain data for capture.json's `witnesses`."""
@@ -119,12 +120,26 @@ def look(sequence: PatternSequence, thumbnails: Mapping[int, Pixels], max_value:
     noise = _noise(sequence, frames, (int(shape[0]), int(shape[1])))
     spread = _spread(list(frames.values()))
     contrast = float(np.quantile(spread, 0.995))
-    # n normal samples range over about 2 sqrt(2 ln n) sigma.
-    range_of_noise = 2 * float(np.sqrt(2 * np.log(len(frames)))) * noise
+    range_of_noise = _range(noise, len(frames))
     if contrast < range_of_noise + NOISE_SIGMAS * noise:
         return None
     lit = spread > max(LIT_SHARE * contrast, range_of_noise + NOISE_SIGMAS * noise / 2)
     return Scene(sequence, frames, (int(shape[0]), int(shape[1])), max_value, noise, lit, contrast)
+
+
+def samples_in_noise(
+    sequence: PatternSequence, thumbnails: Mapping[int, Pixels]
+) -> tuple[dict[int, Array], float, float]:
+    """Where `look` finds nothing: the samples by position, their noise, and the change that it would have seen."""
+    frames = _samples(thumbnails)
+    height, width = next(iter(thumbnails.values())).shape
+    noise = _noise(sequence, frames, (int(height), int(width)))
+    return frames, noise, _range(noise, len(frames)) + NOISE_SIGMAS * noise
+
+
+def _range(noise: float, count: int) -> float:
+    """Of some samples of noise: n normal ones range over about 2 sqrt(2 ln n) sigma."""
+    return 2 * float(np.sqrt(2 * np.log(count))) * noise
 
 
 def listed(frames: Iterable[int]) -> str:

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 from scanner.devices import Pixels
 from scanner.patterns import GrayPmpPattern, PartSequence, PatternSequence
 from scanner.patterns.sequence import SENTINELS_AFTER, SENTINELS_BEFORE
-from scanner.sequencer.findings import Scene, Witness, Witnesses, equal_positions, look
+from scanner.sequencer.darkness import why_dark
+from scanner.sequencer.findings import Scene, Witness, Witnesses, equal_positions, look, samples_in_noise
 from scanner.sequencer.witness_fringes import fringe_witnesses
 from scanner.sequencer.witness_gray import gray_witnesses
 from scanner.sequencer.witness_levels import level_witnesses
@@ -85,9 +86,10 @@ def witness(
     if heard is None or not heard.of(_before_last(sequence, thumbnails)):
         heard = hear(sequence, thumbnails, max_value)
     if heard.scene is None:
-        return Witnesses(
-            (Witness("light", False, 0.0, 0.0, says="no pixel changes with the projector's pattern"),), dark=True
-        )
+        frames, noise, least = samples_in_noise(sequence, thumbnails)
+        why = why_dark(sequence, frames, max_value, noise, least)
+        says = "no pixel changes with the projector's pattern"
+        return Witnesses((Witness("light", False, 0.0, 0.0, says=says),), dark=True, why_dark=why)
     cannot: list[str] = []
     items = level_witnesses(heard.scene.with_frames(thumbnails), cannot)
     return Witnesses((*items, *heard.items), (*cannot, *heard.cannot_reveal))

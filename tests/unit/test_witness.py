@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 from functools import cache
 from typing import Literal
 
@@ -13,6 +14,7 @@ from scanner.devices import Pixels
 from scanner.patterns import GrayPattern, PatternSequence, PmpPattern
 from scanner.patterns.description import Axis
 from scanner.sequencer import Hearing, Witnesses, witness
+from scanner.sequencer.disorder import sync_error
 from scanner.sequencer.witness import hear
 from tests.unit.sequencer_bench import QUICK, Taken, gray, pmp, take
 
@@ -110,13 +112,28 @@ def test_a_small_lit_object_is_not_accused_and_what_it_cannot_reveal_is_said() -
     assert any("order bars" in text for text in found.cannot_reveal)
 
 
-def test_nothing_lit_is_said_clearly() -> None:
+@pytest.mark.parametrize(
+    ("black", "adds", "says", "hint"),
+    [
+        (5, 0, "nothing in the camera's view is lit", "lens cap"),
+        (20, 6, "too weak: it adds [567] of 255.*other light makes 20", "times as long.*darken the room"),
+        (2, 6, "too weak: it adds [567] of 255 .* noise of [0-9.]*$", "times as long .*move nearer$"),
+        (300, 0, "saturated without the projector's light", "shorten the exposure"),
+    ],
+)
+def test_nothing_lit_is_said_clearly(black: int, adds: int, says: str, hint: str) -> None:
     rng = np.random.default_rng(3)
     sequence = PATTERNS["8 shifts"]
-    shown = {p: rng.normal(5, 1.5, (120, 160)).clip(0).astype(np.uint8) for p in range(len(sequence))}
+    shown = {}
+    for p in range(len(sequence)):
+        level = black + adds * sequence.light(p)[:, :160][:120] + rng.normal(0, 1, (120, 160))
+        shown[p] = np.rint(level.clip(0, 255)).astype(np.uint8)
     found = witness(sequence, shown, 255)
     assert found.dark
     assert not found.passed
+    error = sync_error(sequence, (), found, ())
+    assert re.search(says, str(error))
+    assert re.search(hint, error.hint)
 
 
 def test_captures_from_elsewhere_are_judged_by_what_they_have() -> None:
