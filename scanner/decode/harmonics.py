@@ -112,6 +112,7 @@ def spectra_of(
     """
     count = int(np.count_nonzero(good[::every]))
     found: list[SetSpectrum | None] = []
+    like = frames.like
     for k, alpha in enumerate(frames.angles):
         if count < LEAST_PIXELS or not len(alpha):
             found.append(None)
@@ -120,13 +121,14 @@ def spectra_of(
         sums = np.zeros((ORDERS + 1, SUMS))
         weights = height_weights(alpha)
         total = sum_spectra(
-            frames.addresses[first : first + shifts], frames.like, weights, _folded(shifts),
+            frames.addresses[first : first + shifts], like, weights, _folded(shifts),
             runs, good.shape[1], every, good, level, sums,
         )  # fmt: skip
-        orders = range(2, len(weights) + 1)
-        ratios = tuple(_ratio(sums[m], 2 * m == shifts) for m in orders)
-        left = tuple(_left(sums[m], ratio, 2 * m == shifts) / count for m, ratio in zip(orders, ratios, strict=True))
-        found.append(SetSpectrum(shifts, ratios, left, float(sums[1, POWER]) / count, total / count))
+        # A few numbers: without arrays.
+        rows, orders = sums.tolist(), range(2, len(weights) + 1)
+        ratios = tuple(_ratio(rows[m], 2 * m == shifts) for m in orders)
+        left = tuple(_left(rows[m], ratio, 2 * m == shifts) / count for m, ratio in zip(orders, ratios, strict=True))
+        found.append(SetSpectrum(shifts, ratios, left, rows[1][POWER] / count, total / count))
     return tuple(found)
 
 
@@ -188,10 +190,10 @@ def _folded(shifts: int) -> int:
     return shifts // 2 if shifts % 2 == 0 and 2 <= shifts // 2 <= ORDERS else 0
 
 
-def _ratio(sums: NDArray[np.float64], folded: bool) -> complex:
+def _ratio(sums: list[float], folded: bool) -> complex:
     """The ratio that explains most of an order's height."""
     if not folded:
-        return complex(sums[REAL], sums[IMAGINARY]) / max(float(sums[POWER]), 1e-12)
+        return complex(sums[REAL], sums[IMAGINARY]) / max(sums[POWER], 1e-12)
     aa, ab, bb = sums[AA], sums[AB], sums[BB]
     determinant = aa * bb - ab * ab
     if determinant < 1e-9 * aa * bb:
@@ -200,7 +202,7 @@ def _ratio(sums: NDArray[np.float64], folded: bool) -> complex:
     return complex(real / determinant, imaginary / determinant)
 
 
-def _left(sums: NDArray[np.float64], ratio: complex, folded: bool) -> complex:
+def _left(sums: list[float], ratio: complex, folded: bool) -> complex:
     meant = ratio * complex(sums[MEANT_REAL], sums[MEANT_IMAGINARY])
     return complex(sums[SEEN_REAL], sums[SEEN_IMAGINARY]) - (meant.real if folded else meant)
 

@@ -7,6 +7,8 @@ nothing. This file does not know where the residuals come from.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import mul
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,22 +60,29 @@ def fit_noise(level: NDArray[np.float32], squares: NDArray[np.float32], freedom:
         return default_noise(max_value)
     # As many in each bin: up to eleven of the brightest are left out.
     levels, medians, _ = middles_of_bins(level, squares, _LEVELS, True)
-    x, y = levels.astype(np.float64), medians.astype(np.float64)
-    y /= freedom * (1 - 2 / (9 * freedom)) ** 3
+    # A dozen numbers: without arrays.
+    per_freedom = freedom * (1 - 2 / (9 * freedom)) ** 3
+    x, y = levels.tolist(), [of_bin / per_freedom for of_bin in medians.tolist()]
     # A variance's own error grows with it: weights 1 / y, one round of which is enough for two parameters.
-    w = 1 / np.maximum(y, ROUNDING_VARIANCE)
-    slope, read = _line(x, y, w * w) if np.ptp(x) > 1 else (0.0, float(np.median(y)))
+    w = [1 / max(of_bin, ROUNDING_VARIANCE) for of_bin in y]
+    slope, read = _line(x, y, [one * one for one in w]) if max(x) - min(x) > 1 else (0.0, median(y))
     if slope < 0:
-        slope, read = 0.0, float(np.average(y, weights=w))
+        slope, read = 0.0, _dot(w, y) / sum(w)
     elif read < ROUNDING_VARIANCE:
         read = ROUNDING_VARIANCE
-        slope = max(float(np.sum(w**2 * x * (y - read)) / max(np.sum(w**2 * x * x), 1e-12)), 0.0)
-    return NoiseModel(max(float(read), ROUNDING_VARIANCE), float(slope), measured=True)
+        there = [a * a * b for a, b in zip(w, x, strict=True)]
+        slope = max(_dot(there, [of_bin - read for of_bin in y]) / max(_dot(there, x), 1e-12), 0.0)
+    return NoiseModel(max(read, ROUNDING_VARIANCE), slope, measured=True)
 
 
-def _line(x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]) -> tuple[float, float]:
+def _line(x: list[float], y: list[float], weights: list[float]) -> tuple[float, float]:
     """Slope and value at 0 of the line with the least weighted squares."""
-    total = weight.sum()
-    x0, y0 = (weight @ x) / total, (weight @ y) / total
-    slope = (weight * (x - x0)) @ y / ((weight * (x - x0)) @ (x - x0))
-    return float(slope), float(y0 - slope * x0)
+    total = sum(weights)
+    x0, y0 = _dot(weights, x) / total, _dot(weights, y) / total
+    there = [w * (at - x0) for w, at in zip(weights, x, strict=True)]
+    slope = _dot(there, [of_bin - y0 for of_bin in y]) / _dot(there, [at - x0 for at in x])
+    return slope, y0 - slope * x0
+
+
+def _dot(a: list[float], b: list[float]) -> float:
+    return float(sum(map(mul, a, b)))

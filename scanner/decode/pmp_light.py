@@ -27,6 +27,7 @@ from scanner.decode.noise import NoiseModel
 from scanner.decode.pmp_frames import AxisFrames
 from scanner.decode.pmp_sample import PRIOR_FREEDOM, Sample, take_fine_sample
 from scanner.decode.ripples import FEWEST_SHIFTS_UNHARMED, ripples
+from scanner.decode.sample_kernels import mean_of_good
 from scanner.decode.unwrapping import Ladder
 
 THINNED = 8
@@ -84,10 +85,8 @@ def judge_light(
     """
     good = sample.lit(least, sigmas)
     spectra = spectra_of(frames, sample.runs, THINNED, good, sample.mean)
-    asked = good[::THINNED]
-    count = max(int(np.count_nonzero(asked)), 1)
+    left, count = mean_of_good(sample.residual, good, THINNED)
     energy = sum(s.energy for s in spectra if s is not None)
-    left = float(sample.residual[::THINNED][asked].mean()) if asked.any() else 0.0
     variance = max(left - energy, 0.0) / max(frames.freedom, 1)
     if energy > LEAST_EXPLAINED * max(left - energy, 1e-6):
         pixels = (sample.runs[:, None] + np.arange(good.shape[1])).reshape(-1)
@@ -99,10 +98,11 @@ def judge_light(
     if not tell:
         return sample, Light((), None)
     told = (
-        told_of(float(frequency), shifts, spectrum, variance, count)
+        told_of(float(frequency), shifts, spectrum, variance, max(count, 1))
         for frequency, shifts, spectrum in zip(frequencies, frames.shifts, spectra, strict=True)
     )
     finest = max(range(len(frequencies)), key=lambda k: frequencies[k])
+    asked = good[::THINNED]
     return sample, Light(tuple(told), _changes(spectra, sample, asked, variance, finest, along / frequencies[finest]))
 
 

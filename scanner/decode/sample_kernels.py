@@ -91,6 +91,18 @@ def count_lit(modulations: NDArray[np.float32], usable: NDArray[np.bool_], least
 
 
 @kernel
+def mean_of_good(values: NDArray[np.float32], good: NDArray[np.bool_], every: int) -> tuple[float, int]:
+    """Mean of (R, L) values at good pixels of one row in `every`, 0 where there is none; and how many these are."""
+    total, count = 0.0, 0
+    for r in range(0, good.shape[0], every):
+        for i in range(good.shape[1]):
+            if good[r, i]:
+                total += values[r, i]
+                count += 1
+    return total / max(count, 1), count
+
+
+@kernel
 def judge_steps(
     phases: NDArray[np.float32],
     cycles2: NDArray[np.float32],

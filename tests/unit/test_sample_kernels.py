@@ -9,6 +9,7 @@ from scanner.decode.agreement import agreement, remainders_of
 from scanner.decode.middles import middle_of_squares, middles_of_bins, nth_of, order_of
 from scanner.decode.noise import NoiseModel
 from scanner.decode.pmp_sample import Sample
+from scanner.decode.sample_kernels import mean_of_good
 from scanner.decode.unwrapping import plan_ladder
 
 BINS = 8
@@ -80,6 +81,10 @@ def test_good_pixels_are_those_of_the_plain_form():
     enough = np.maximum(np.float32(sigmas**2) * variance, np.float32(least**2))
     good = (drawn.modulations**2 > enough).all(axis=0) & drawn.usable
     assert 500 < np.count_nonzero(good) < 1900
+    mean, count = mean_of_good(drawn.residual, good, 8)
+    assert count == np.count_nonzero(good[::8])
+    assert mean == pytest.approx(drawn.residual[::8][good[::8]].mean(), rel=1e-5)
+    assert mean_of_good(drawn.residual, np.zeros_like(good), 8) == (0.0, 0)
     assert np.array_equal(drawn.good(noise, least, sigmas), good)
     assert np.array_equal(judged.phases, drawn.phases[:, good])
     cycles2 = (variance / np.float32(4 * np.pi**2))[:, good] / drawn.modulations[:, good] ** 2
