@@ -73,7 +73,7 @@ make_environment() {
 
 compile_kernels() {
     local sources stamp
-    sources=$(grep -rlE '@(parallel_)?kernel|def warm_up' scanner drivers service --include='*.py' | sort)
+    sources=$(grep -rlE 'numba|@[a-z_]*kernel|scanner\.lanes|def warm_up' scanner drivers service --include='*.py' | sort)
     # shellcheck disable=SC2086  # file names of this project hold no blanks
     stamp=$(cat setup/constraints.txt $sources | sha256sum; echo "$clone")
     [ "$(cat "$state/kernels" 2>/dev/null)" != "$stamp" ] || return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -78,3 +79,12 @@ def test_every_kernel_is_compiled_at_set_up() -> None:
     )  # fmt: skip
     assert ran.returncode == 0, ran.stderr
     assert json.loads(ran.stdout) == []
+
+
+def test_set_up_compiles_anew_when_any_kernel_has_changed() -> None:
+    """Numba looks at a kernel's own file only; set-up must know those whose kernels are part of others as well."""
+    (pattern,) = re.findall(r"sources=\$\(grep -rlE '([^']+)'", (ROOT / "setup/install.sh").read_text())
+    sources = [path for room in ("scanner", "drivers", "service") for path in sorted((ROOT / room).rglob("*.py"))]
+    kernels = [path for path in sources if re.search(r"^@\w*kernel", path.read_text(), re.MULTILINE)]
+    assert len(kernels) > 40
+    assert not [path for path in [*kernels, ROOT / "scanner/lanes.py"] if not re.search(pattern, path.read_text())]
