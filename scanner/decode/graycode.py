@@ -20,6 +20,7 @@ from scanner.decode.frames import FrameCheck
 from scanner.decode.graycode_bits import BOTH, INVERSE, PLAIN
 from scanner.decode.graycode_blur import blurred_bits, shares_decided
 from scanner.decode.graycode_kernels import decode_codes, gather
+from scanner.decode.middles import nth_of
 from scanner.decode.noise import ROUNDING_VARIANCE, default_noise
 from scanner.decode.reasons import REASONS
 from scanner.decode.runs import runs_of
@@ -197,6 +198,8 @@ class GrayDecoder:
     def _check_complete(self, codes: _Codes) -> tuple[str, ...]:
         pattern, sequence = self._pattern, self._sequence
         each, have = pattern.frames_per_bit, codes.addresses != 0
+        if have[:, :, :each].all() and (each == 2 or codes.has_levels):
+            return ()
         lost, warnings = [], []
         for index, axis in enumerate(pattern.axes):
             for bit in range(pattern.bits):
@@ -321,7 +324,7 @@ class GrayDecoder:
 
 def _middle(values: NDArray[np.float32]) -> float:
     # One of the two in the middle, where there are two: np.median takes their mean, and three times as long.
-    return float(np.partition(values, values.size // 2)[values.size // 2])
+    return float(nth_of(values, values.size // 2))
 
 
 def warm_up() -> None:
