@@ -28,8 +28,9 @@ from scanner.calibration.targets import Target
 from scanner.capture import Capture
 from scanner.client import Client
 from scanner.client_sockets import conflated
-from scanner.errors import CalibrationError, DecodeError, SyncError, Unreachable
+from scanner.errors import CalibrationError, DecodeError, StorageError, SyncError, Unreachable
 from scanner.session import raise_unless_done
+from scanner.storage import storage_errors
 from scanner.wire import Event
 from scanner.wire_images import decode_preview
 
@@ -46,6 +47,21 @@ PATIENCE_S = 120.0
 devices up."""
 
 OnEvent = Callable[[Event], None]
+
+
+def require_own(folder: Path, *names: str) -> None:
+    """A run goes on in its own folder, or in an empty one. names: of files that a run leaves there, beside its poses.
+
+    Raises:
+        StorageError: the folder holds what no run has left there.
+    """
+    with storage_errors(folder):
+        there = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    if there and not there & {POSES, *names}:
+        raise StorageError(
+            f"{folder} is not empty, and nothing in it is a calibration run's",
+            hint="give another -o DIR: a new one, or one of an earlier run, which then goes on",
+        )
 
 
 class GuidedCalibration:

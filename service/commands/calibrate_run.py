@@ -97,6 +97,7 @@ def run(
     from scanner.errors import ConfigError  # noqa: PLC0415
     from scanner.storage import storage_errors, try_file  # noqa: PLC0415
     from service.config import is_simulated  # noqa: PLC0415
+    from service.guided_calibration import require_own  # noqa: PLC0415
 
     if (rig is None) == (connect is None):
         raise typer.BadParameter("give RIG, or --connect to a running daemon, which has a rig of its own")
@@ -113,6 +114,7 @@ def run(
     result = folder / CALIBRATION_FILE
     if result.exists() and not force:
         raise typer.BadParameter(f"-o: {result} exists; --force goes on with its poses and replaces it")
+    require_own(folder, LIVE_PICTURE, CALIBRATION_FILE)
     with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     for path in (result, picture or folder / LIVE_PICTURE, *((Path(rig),) if write and rig is not None else ())):

@@ -19,10 +19,11 @@ from scanner.calibration.sight import Sight, Standing
 from scanner.calibration.targets import parse_target
 from scanner.client import Client
 from scanner.clock import VirtualClock
-from scanner.errors import Unreachable
+from scanner.errors import StorageError, Unreachable
 from scanner.patterns.sequence import Precorrection
 from service.commands import calibrate_run
 from service.config import load_rig
+from service.guided_calibration import require_own
 from service.keys import Keys, keys
 from service.response_check import checked
 from service.response_measure import first_response
@@ -31,6 +32,20 @@ from tests.unit.simulated_bench import Bench
 
 TARGET = parse_target("chessboard:9x6:19")
 SIZE = (320, 240)
+
+
+@pytest.mark.parametrize(
+    ("there", "taken"), [("mcp.py", False), ("calibrate.png", True), ("poses", True), (None, True)]
+)
+def test_a_run_goes_into_an_empty_folder_or_one_of_its_own(tmp_path: Path, there: str | None, taken: bool) -> None:
+    if there is not None:
+        (tmp_path / there).touch()
+    if taken:
+        require_own(tmp_path, "calibrate.png")
+        return
+    with pytest.raises(StorageError, match="is not empty") as refused:
+        require_own(tmp_path, "calibrate.png")
+    assert "another -o DIR" in str(refused.value.hint)
 
 
 class Pressed(Keys):
