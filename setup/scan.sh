@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# `make scan`: a scan of the simulated rig into a fresh folder scans/TIME, and the link `scan` to the newest one.
+# `make scan`: a scan of the simulated rig into a fresh folder scan-DATE-TIME, and the link `scan` to it.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
-folder=scans/$(date +%Y%m%d-%H%M%S)
+folder=scan-$(date +%Y%m%d-%H%M%S)
 n=2
 while [ -e "$folder" ]; do folder=${folder%%_*}_$((n++)); done
 .venv/bin/fringed scan -o "$folder" "$@"
