@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from scanner.digits import alone, rounded, with_uncertainty
 from service.commands.calibrate_marks import region_given
 from service.commands.calibrate_solve import Replace
 from service.commands.options import AsJson, output_path
@@ -56,7 +58,9 @@ def verify(
 ) -> int:
     """Measure known features in scans, in the words of VDI/VDE 2634 part 2. All lengths are mm.
 
-    Each figure has an expanded uncertainty (k = 2): of the calibration, by its covariance, and of the points used.
+    Figures of a board, a sphere, a length have an expanded uncertainty (+-, k = 2): of the calibration, by its
+    covariance, and of the points used; --repeat's deviation has one of the number of scans. Without one: noise, which
+    is an expectation; --edge; --marks, which say what is allowed; --repeat's drift.
 
     \b
     Examples:
@@ -98,14 +102,15 @@ def verify(
         for number, folder in enumerate(scans):
             scan = load_scan(folder)
             measured = verified(folder, scan, wanted, calibration)
-            unsure = (scan.report.get("uncertainty") or {}).get("systematic_mm")
-            results.append({"scan": str(folder), "systematic_mm": unsure, **measured})
+            budget = scan.report.get("uncertainty") or {}
+            results.append({"scan": str(folder), "systematic_mm": budget.get("systematic_mm"), **measured})
+            results[-1]["systematic_besides"] = _besides(budget, measured)
             if repeat and scan.xyz is not None:
                 clouds.append(scan.xyz)
             lines.advance(number + 1, len(scans))
         document: dict[str, Any] = {"scans": results}
         if repeat:
-            document["repeatability"] = plain(repeatability(clouds))
+            document["repeatability"] = _with_spread(plain(repeatability(clouds)))
     worst = _worst(document)
     document["largest_error_mm"] = worst
     if as_json:
@@ -203,8 +208,7 @@ def _errors(document: dict[str, Any]) -> list[tuple[float, float | None]]:
     errors: list[tuple[float, float | None]] = []
     if "repeatability" in document:
         found = document["repeatability"]
-        sure = found["depth_mm"] / (2 * (found["scans"] - 1) * found["points"]) ** 0.5  # of a standard deviation
-        errors.append((found["depth_mm"], 2 * sure))
+        errors.append((found["depth_mm"], found["uncertainty"]["depth_mm"]["expanded"]))
     for one in document["scans"]:
         for kind, names in (("flat", ("flatness_mm",)), ("sphere", ("form_mm", "size_mm")), ("length", ("error_mm",))):
             if kind in one:
@@ -241,6 +245,34 @@ def _cells_of(kind: str, values: dict[str, Any]) -> dict[str, Any]:
     return {name: _cell(value, spreads.get(name)) for name, value in shown.items() if isinstance(value, int | float)}
 
 
+def _with_spread(found: dict[str, Any]) -> dict[str, Any]:
+    """A repeatability with the uncertainty of its standard deviation: s / sqrt(2 (n - 1)) of n scans (JCGM 100, E.4.3).
+
+    That is of one pixel. What makes scans differ (light, warmth) is common to pixels: their number makes it no surer.
+    """
+    sigma = found["depth_mm"] / (2 * (found["scans"] - 1)) ** 0.5
+    return {**found, "uncertainty": {"depth_mm": {"random": sigma, "expanded": 2 * sigma}}}
+
+
+def _besides(budget: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any] | None:
+    """What is systematic in a scan and in none of its figures' U; None where the scan has no budget.
+
+    Where U contains the calibration, by its covariance, that is what the others leave: it counts once.
+    """
+    if budget.get("systematic_mm") is None:
+        return None
+    contained = "coverage_factor" in measured and measured["unknown"] is None
+    if not contained or "contributions" not in budget:
+        return {"mm": budget["systematic_mm"], "calibration": True, "unknown": list(budget.get("unknown") or ())}
+    others = [c for c in budget["contributions"] if c["kind"] == "systematic" and c["name"] != "calibration"]
+    known = [c["mm"] for c in others if c["mm"] is not None]
+    return {
+        "mm": math.hypot(*known),
+        "calibration": False,
+        "unknown": [c["name"] for c in others if c["mm"] is None],
+    }
+
+
 def _show(document: dict[str, Any]) -> None:
     for kind in ("flat", "sphere", "length", "edge", "marks"):
         rows = [(one["scan"], _cells_of(kind, one[kind])) for one in document["scans"] if kind in one]
@@ -252,15 +284,31 @@ def _show(document: dict[str, Any]) -> None:
     for one in document["scans"]:
         if (said := one.get("marks", {}).get("warning")) is not None:
             print_error(f"{one['scan']}: {said}", label="warning")
-    facts = [(name.replace("_", " "), _cell(value)) for name, value in document.get("repeatability", {}).items()]
+    facts = _of_repeats(document.get("repeatability"))
     facts.append(("largest error", f"{document['largest_error_mm']:.4f} mm, as measured"))
     for one in document["scans"]:
         if "coverage_factor" in one:
             facts.append(("+-", f"{_of_uncertainty(one)}: {one['scan']}"))
-        unsure = one["systematic_mm"]
-        said = "not told" if unsure is None else f"{unsure:.4f} mm of depth (1 sigma)"
-        facts.append(("systematic", f"{said}, in none of these figures: {one['scan']}"))
+        facts.append(("systematic", f"{_of_systematic(one['systematic_besides'])}: {one['scan']}"))
     print_facts("verification", facts)
+
+
+def _of_repeats(found: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """Lines of a repeatability."""
+    if found is None:
+        return []
+    shown = with_uncertainty(found["depth_mm"], found["uncertainty"]["depth_mm"]["expanded"])
+    of = f"standard deviation of {found['scans']} scans (k = 2, by their number), rms over {found['points']:,} pixels"
+    return [("depth mm", f"{shown}: {of}"), ("drift mm", f"{rounded(found['drift_mm'])}, of the farthest scan's mean")]
+
+
+def _of_systematic(besides: dict[str, Any] | None) -> str:
+    """What is in none of a scan's uncertainties, in words."""
+    if besides is None:
+        return "not told, in none of these figures"
+    whole = "" if besides["calibration"] else " besides the calibration"
+    unknown = f"; unknown: {', '.join(besides['unknown'])}" if besides["unknown"] else ""
+    return f"+-{alone(2 * besides['mm'])} mm of depth (k = 2){whole}, in none of these figures{unknown}"
 
 
 def _of_uncertainty(one: dict[str, Any]) -> str:
@@ -271,16 +319,15 @@ def _of_uncertainty(one: dict[str, Any]) -> str:
     largest = max(
         (s["random"] for part in parts for n, s in part.items() if n.endswith("_mm") and s["random"]), default=0
     )
-    return f"unknown, {one['unknown']} (the points' own part, k = 2: up to {2 * largest:.4f} mm)"
+    return f"unknown, {one['unknown']} (the points' own part, k = 2: up to {alone(2 * largest)} mm)"
 
 
 def _cell(value: float | None, spread: dict[str, float | None] | None = None) -> str:
     if value is None:
         return "-"
-    shown = f"{value:,}" if isinstance(value, int) else f"{value:.4f}"
-    if spread is None:
-        return shown
-    return f"{shown} +- {'unknown' if spread['expanded'] is None else format(spread['expanded'], '.4f')}"
+    if spread is not None:
+        return with_uncertainty(value, spread["expanded"])
+    return f"{value:,}" if isinstance(value, int) else rounded(value)
 
 
 def _both(pmp: Path, single: Path) -> tuple[Any, Any, float, str]:

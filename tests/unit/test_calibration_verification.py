@@ -234,7 +234,12 @@ def test_verify_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     assert main(["calibrate", "verify", *boards, "--flat", "--repeat", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert len(document["scans"]) == 3
-    assert document["repeatability"]["scans"] == 3
+    repeats = document["repeatability"]
+    assert repeats["scans"] == 3
+    # Of n = 3: s / sqrt(2 (n - 1)), twice.
+    assert repeats["uncertainty"]["depth_mm"]["expanded"] == pytest.approx(repeats["depth_mm"])
+    assert main(["calibrate", "verify", *boards, "--repeat"]) == 0
+    assert "standard deviation of 3 scans (k = 2, by their number)" in capsys.readouterr().out
     assert document["largest_error_mm"] == pytest.approx(0.119, rel=0.1)
     assert main(["calibrate", "verify", boards[0], "--flat", "--tolerance", "0.05"]) == 1
     shown = capsys.readouterr()
@@ -257,7 +262,7 @@ def test_verify_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     (tmp_path / "ball" / "report.json").write_text(json.dumps(budget))
     assert main(["calibrate", "verify", ball_folder, "--sphere", "50", "--tolerance", "0.2"]) == 0
     shown = capsys.readouterr()
-    assert "0.2900 mm of depth (1 sigma), in none of these figures" in " ".join(shown.out.split())
+    assert "+-0.58 mm of depth (k = 2), in none of these figures" in " ".join(shown.out.split())
     albedo, xyz = scanned_target()
     row = str(save(tmp_path / "target", xyz, albedo.astype(np.float32)))
     capsys.readouterr()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -149,8 +150,19 @@ def test_verify_takes_the_calibration_that_made_the_scan_and_no_other(tmp_path, 
     assert found["sphere"]["size_mm"] == pytest.approx(0.5, abs=0.03)
     assert "with its expanded uncertainty (k = 2), 0.7" in shown.err
     assert shown.err.rstrip().endswith("it is not")
+    of_budget = [
+        {"name": "calibration", "kind": "systematic", "mm": 0.2809},
+        {"name": "response", "kind": "systematic", "mm": 0.016},
+        {"name": "sync", "kind": "systematic", "mm": None},
+    ]
+    report = tmp_path / "a" / "report.json"
+    budget = {"systematic_mm": 0.2813, "contributions": of_budget, "unknown": ["sync"]}
+    report.write_text(json.dumps({**json.loads(report.read_text()), "uncertainty": budget}))
     assert main(ask) == 0
-    assert "+- 0.2" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert re.search(r"\b0\.\d\d \+- 0\.2\d\b", said), "value and U end at one place"
+    # U contains the calibration: only the others are said to be in none of the figures.
+    assert "+-0.032 mm of depth (k = 2) besides the calibration, in none of these figures; unknown: sync" in said
     save(tmp_path / "b", *ball(), "another")
     without, other = tmp_path / "without.json", tmp_path / "other.json"
     without.write_text(json.dumps(rig(covariance=None)))
