@@ -220,6 +220,11 @@ def check_room(folder: Path, needed: int) -> None:
         )
 
 
+def is_full(error: StorageError) -> bool:
+    """Whether it was for want of room: deleting something helps."""
+    return isinstance(error.__cause__, OSError) and error.__cause__.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
 @contextmanager
 def storage_errors(path: Path) -> Iterator[None]:
     """Turn the system's errors about `path` into StorageError with a hint."""

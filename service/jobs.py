@@ -284,6 +284,10 @@ class JobStore:
         """
         replace_json(self.folder / f"{job_id}.json", record)
 
+    def record(self, job: Job) -> None:
+        """Write a job's record as it is now; see `write`."""
+        self.write(job.id, job.record())
+
     def unfinished(self) -> list[Job]:
         """Jobs that are not over, oldest first."""
         return [job for job in self if not job.state.over]

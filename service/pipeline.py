@@ -45,6 +45,7 @@ class Pipeline:
     ) -> None:
         self.store = store
         self.spool = spool
+        spool.record = store.record
         self._devices = devices
         self._workers = workers
         self._publish = publish
@@ -141,12 +142,11 @@ class Pipeline:
 
         Raises:
             Refused: it is not over.
-            StorageError: the folder cannot be changed.
+            StorageError: the folder cannot be changed, or the record not written; nothing is deleted.
         """
         if not job.state.over:
             raise Refused(f"job {job.id} is {job.state}", reason="not_over", hint="cancel it first")
         trash = await self.on_disk(self.spool.remove, job)
-        await self.save(job)
         await asyncio.to_thread(empty_trash, trash)
         self._publish("spool.deleted", job.id, {})
 
@@ -216,7 +216,6 @@ class Pipeline:
         # While the scan before decodes, its room is taken already: files reserved ahead count in full.
         gone = await self.on_disk(self.spool.make_room, need.bytes, list(self.store))
         for deleted in gone:
-            await self.save(deleted)
             self._publish("spool.deleted", deleted.id, {})
 
     def began(self, job: Job) -> None:
@@ -384,7 +383,6 @@ class Pipeline:
         while True:
             try:
                 for job in await self.on_disk(self.spool.sweep, list(self.store)):
-                    await self._note(job)
                     self._publish("spool.deleted", job.id, {})
                 await self.on_disk(
                     self.store.expire, lambda job: not job.deleted and self.spool.folder(job.id).exists()

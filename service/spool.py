@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from scanner.errors import StorageError
-from scanner.storage import check_room, storage_errors
+from scanner.storage import check_room, is_full, storage_errors
 from service.jobs import Job, JobState
 
 CAPTURE = "capture"
@@ -47,6 +47,8 @@ class Spool:
     root: Path
     limits: Limits = Limits()
     now: Callable[[], float] = time.time
+    record: Callable[[Job], None] = lambda _: None
+    """writes a job's record, once its files are gone (the pipeline's, into its store)"""
     _leases: dict[str, float] = field(default_factory=dict)
 
     def prepare(self) -> None:
@@ -120,19 +122,39 @@ class Spool:
         empty_trash(self.remove(job))
 
     def remove(self, job: Job) -> Path:
-        """Take a job's files out of the spool at once; returns where they are until `empty_trash`.
+        """Take a job's files out of the spool at once, and record it; returns where they are until `empty_trash`.
 
         Raises:
-            StorageError: the folder cannot be changed.
+            StorageError: the folder cannot be changed, or the record not written: the files are where they were.
         """
         folder, trash = self.folder(job.id), self.root / f"{_TRASH}{job.id}"
         with storage_errors(folder):
-            if folder.exists():
+            taken = folder.exists()
+            if taken:
                 folder.rename(trash)
-        job.deleted = True
+        before, job.deleted = job.deleted, True
+        try:
+            self.record(job)
+        except StorageError as problem:
+            if is_full(problem):
+                self._record_in_their_place(job, trash)
+            else:
+                if taken:
+                    with storage_errors(folder):
+                        trash.rename(folder)
+                job.deleted = before
+                raise
         self._leases.pop(job.id, None)
         _log.info("files of job %s deleted", job.id)
         return trash
+
+    def _record_in_their_place(self, job: Job, trash: Path) -> None:
+        """A full disk has no room for the record but what the files take: they go first."""
+        empty_trash(trash)
+        try:
+            self.record(job)
+        except StorageError as problem:  # filled again meanwhile; the next daemon sees that there is no folder
+            _log.error("job %s is deleted, which cannot be recorded: %s", job.id, problem)
 
     def _old(self, job: Job) -> bool:
         age = self.limits.max_age_s

@@ -15,11 +15,12 @@ import pytest
 
 from scanner.clock import VirtualClock
 from scanner.errors import StorageError
+from scanner.storage import storage_errors
 from scanner.stream import PointsNote
 from scanner.wire import ArrayEntry, FileEntry, ScanStart
 from service.acquisition import Scan
 from service.jobs import Job, JobState, JobStore
-from service.pipe import CancelAcquire, Ended, Taken, framed, read_command
+from service.pipe import CancelAcquire, Ended, Need, Taken, framed, read_command
 from service.pipeline import Pipeline
 from service.series import Series
 from service.spool import Spool
@@ -223,3 +224,44 @@ def test_files_that_cannot_be_deleted_are_not_called_deleted(tmp_path: Path, mon
         spool.remove(job)
     assert not job.deleted
     assert spool.may_go(job)
+
+
+@pytest.mark.parametrize("way", ["delete", "make_room"])
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EPERM])
+async def test_deleting_on_a_full_disk_frees_it_and_elsewhere_a_record_unwritten_keeps_the_files(
+    bench: Bench, number: int, way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = bench.store.make(ScanStart(str(uuid.uuid4())), "test")
+    job.state, job.acknowledged, job.files = JobState.DONE, True, (FileEntry("capture/frames.npy", 1, ""),)
+    bench.spool.capture(job.id).mkdir(parents=True)
+    (bench.spool.capture(job.id) / "frames.npy").write_bytes(b"x")
+    bench.store.record(job)
+
+    def write(path: Path, _: object) -> None:
+        if number == errno.EPERM or any(bench.spool.root.rglob("frames.npy")):  # else its bytes are free again
+            with storage_errors(path):
+                raise OSError(number, "no")
+
+    async def delete() -> None:
+        if way == "delete":
+            await bench.pipeline.delete(job)
+            return
+        free = iter([StorageError("full"), None, StorageError("full")])
+        monkeypatch.setattr(bench.spool, "_no_room", lambda _: next(free, None))
+        await bench.pipeline.room_for(job, Need(job.id, frames=1, bytes=1, plan={}))
+
+    with monkeypatch.context() as full:
+        full.setattr("service.jobs.replace_json", write)
+        if number == errno.ENOSPC:
+            await delete()
+        else:
+            with pytest.raises(StorageError, match="no"):
+                await delete()
+    kept = number == errno.EPERM
+    assert any(bench.spool.root.rglob("frames.npy")) is kept
+    assert bench.spool.capture(job.id).is_dir() is kept
+    assert job.deleted is not kept
+    assert ("spool.deleted" in bench.events) is not kept
+    await bench.pipeline.delete(job)  # again, with room
+    assert not any(bench.spool.root.rglob("frames.npy"))
+    assert JobStore(bench.store.folder).get(job.id).deleted
