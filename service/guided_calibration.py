@@ -57,7 +57,7 @@ def require_own(folder: Path, *names: str) -> None:
     """
     with storage_errors(folder):
         there = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    if there and not there & {POSES, *names}:
+    if there and not there & {POSES, INCOMING, *names}:
         raise StorageError(
             f"{folder} is not empty, and nothing in it is a calibration run's",
             hint="give another -o DIR: a new one, or one of an earlier run, which then goes on",

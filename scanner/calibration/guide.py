@@ -96,7 +96,8 @@ class Guide:
         """What the last pose adds, in words."""
         standings = self.standings
         last = standings[-1]
-        words = [f"tilt {last.tilt_deg:.0f} degrees"]
+        about = "about " if self.matrix is None else ""  # the lens is guessed
+        words = [f"tilt {about}{last.tilt_deg:.0f} degrees"]
         if last.tilt_deg >= TILTED_DEG:
             first = not any(_tilted_to(s, last.nearer) for s in standings[:-1])
             words[0] += f", its {last.nearer} {'side ' if last.nearer in SIDES[:2] else ''}nearer"
@@ -134,7 +135,9 @@ class Guide:
         if untilted := [side for side in SIDES if not any(_tilted_to(s, side) for s in standings)]:
             words.append(f"no pose is tilted with its {' or its '.join(untilted)} nearer")
         if span < 2 * DEPTH_SHARE:
-            words.append(f"depths span {span:.1%} of the first pose's ({2 * DEPTH_SHARE:.0%} are asked)")
+            words.append(
+                f"depths of the target's middle span {span:.1%} of the first pose's ({2 * DEPTH_SHARE:.0%} are asked)"
+            )
         if missing := [name for name, there in zip(FIELDS, self.fields(), strict=True) if not there]:
             words.append(f"no points in {len(missing)} of 9 fields of the camera's picture ({', '.join(missing)})")
         return "; ".join(words)

@@ -146,11 +146,12 @@ def _coverage(title: str, size: tuple[int, int], points: Sequence[Array]) -> Pan
 
 def _depth(solution: Solution) -> Panel:
     problem, state = solution.problem, solution.state
-    ranges, tilts = [], []
+    ranges, tilts, middles = [], [], []
     for view, pose in zip(problem.views, state.poses, strict=True):
         rotation = rotation_of(pose[:3])
         z = (problem.target.points[view.ids] @ rotation.T + pose[3:])[:, 2]
         ranges.append((float(z.min()), float(z.max())))
+        middles.append(float(z.mean()))
         tilts.append(float(np.degrees(np.arccos(np.clip(abs(rotation[2, 2]), 0, 1)))))
     low, high = min(r[0] for r in ranges), max(r[1] for r in ranges)
     room = max(high - low, 1e-6)
@@ -162,7 +163,8 @@ def _depth(solution: Solution) -> Panel:
         drawn.bar(first, np.maximum(last, first + 2), _colour(k))
         words = f"{problem.views[k].name[-12:]}: {tilt:.0f} deg"
         drawn.text(words, (drawn.area[2] - 124, (first[1] + last[1]) / 2 + 4), INK, 0.36)
-    drawn.note(f"from {low:.0f} to {high:.0f} mm: {room / ((low + high) / 2):.0%} of the middle distance")
+    span = float(np.ptp(middles)) / middles[0]  # as the guide has it
+    drawn.note(f"points: {low:.0f} to {high:.0f} mm; the target's middle: over {span:.1%} of the first view's distance")
     return drawn
 
 

@@ -88,7 +88,7 @@ def run(
 
     \b
     Examples:
-      fringed calibrate run "simulated:casey2011/charuco_poses?walk=true" --target charuco:10x7:30 --auto -o scans/rig
+      fringed calibrate run "simulated:charuco_poses?walk=true&seed=13" --target charuco:10x7:30 --auto -o scans/rig
       fringed calibrate run bench.toml --target charuco:10x7:30 --length 240.1:0.05 -o bench-calibration
       fringed calibrate run bench.toml --target charuco:10x7:30 --auto --write
     """
@@ -144,6 +144,7 @@ def _guided(
     """Measure, guide, solve: the rig, and the projector's response where it was told."""
     from scanner.client import Client  # noqa: PLC0415
     from scanner.errors import ScannerError  # noqa: PLC0415
+    from service.config import is_simulated  # noqa: PLC0415
     from service.guided_calibration import GuidedCalibration  # noqa: PLC0415
     from service.keys import keys  # noqa: PLC0415
 
@@ -155,7 +156,7 @@ def _guided(
             with keys() as pressed:
                 loop = _Loop(session, asked, pressed, levels)
                 loop.run()
-            _say_lacking(session.guide)
+            _say_lacking(session.guide, simulated=rig is not None and is_simulated(rig))
             with progress_lines() as lines:
                 return session.solved(leave_out=True, progress=lines.stage), loop.response
         except (KeyboardInterrupt, ScannerError):
@@ -336,10 +337,11 @@ def _response(session: GuidedCalibration, levels: LevelResponse | None) -> dict[
     return response
 
 
-def _say_lacking(guide: Guide | None) -> None:
+def _say_lacking(guide: Guide | None, *, simulated: bool = False) -> None:
     """Which of the how-to's conditions the poses do not meet, in one line."""
     if guide is not None and (lacking := guide.lacking()):
-        say(f"not met of what a calibration asks for: {lacking}")
+        why = "; a simulated target's poses are drawn from its seed: other ones with seed=N" if simulated else ""
+        say(f"not met of what a calibration asks for: {lacking}{why}")
 
 
 def _written(

@@ -265,8 +265,10 @@ def test_what_the_poses_lack_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
     calibrate_run._say_lacking(guide)
     said = capsys.readouterr().err
     assert said.startswith("not met of what a calibration asks for: ")
-    assert "depths span 0.0% of the first pose's (15% are asked)" in said
+    assert "depths of the target's middle span 0.0% of the first pose's (15% are asked)" in said
     assert f"no points in {9 - int(guide.fields().sum())} of 9 fields" in said
+    calibrate_run._say_lacking(guide, simulated=True)
+    assert "other ones with seed=N" in capsys.readouterr().err
     calibrate_run._say_lacking(None)
     assert capsys.readouterr().err == ""
 
