@@ -10,6 +10,7 @@ from typing import Any
 
 from scanner.calibration.grey_levels import LevelResponse
 from scanner.calibration.response import Response
+from scanner.digits import with_uncertainty
 
 PRINT_BIAS = 0.03
 """Bound on the share by which fringes on a print tell an exponent wrong. Prints of the simulator (ChArUco, chessboard)
@@ -36,7 +37,7 @@ def checked(found: Response, levels: LevelResponse | None) -> tuple[dict[str, An
     unsure = expanded(found)
     seen = (
         f"response by the target's fringes, a check: light follows what is projected to the power of "
-        f"{found.exponent:.3f} +- {unsure:.3f} (k = 2, {PRINT_BIAS:.0%} of it for print)"
+        f"{with_uncertainty(found.exponent, unsure)} (k = 2, {PRINT_BIAS:.0%} of it for print)"
     )
     if levels is not None:
         return None, (f"{seen}; the file has what grey levels told", *_against_levels(found, levels, unsure))

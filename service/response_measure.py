@@ -9,6 +9,7 @@ import numpy as np
 from scanner.calibration.grey_levels import LEVELS, LevelResponse, response_of_levels
 from scanner.clock import Clock
 from scanner.devices import ProjectorKind
+from scanner.digits import with_uncertainty
 from scanner.errors import CalibrationError, ConfigError
 from scanner.patterns.sequence import Precorrection
 from scanner.sequencer.light import fitting_exposure
@@ -53,7 +54,9 @@ def first_response(config: RigConfig, clock: Clock, stage: Callable[[str], None]
         return None, f"response: not told by grey levels ({error}); {instead}"
     finally:
         opened.close()
-    words = f"gamma {found.gamma:.4f} +- {found.sigma:.4f}" if "gamma" in found.response else "a table"
+    words = (
+        f"gamma {with_uncertainty(found.gamma, 2 * found.sigma)} (k = 2)" if "gamma" in found.response else "a table"
+    )
     instead = "" if claimed is None else _beside(claimed, found)
     return found, (
         f"response: {words}, by {len(found.levels)} grey levels on what is in view; scans will undo it{instead}"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from scanner.digits import with_uncertainty
 from service.commands.options import AsJson
 from service.terminal import ProgressLines, print_facts, print_json, progress_lines
 
@@ -168,17 +169,19 @@ def _facts(found: LevelResponse | Response) -> list[tuple[str, str]]:
     from scanner.calibration.response import Response  # noqa: PLC0415
 
     if isinstance(found, Response):
+        exponent = with_uncertainty(found.exponent, 2 * found.sigma)
         projected = "" if found.gamma is None else f"{found.gamma:.3f}"
         return [
-            ("exponent", f"{found.exponent:.3f} left in this capture (1: the light is linear)"),
-            ("+-", f"{2 * found.sigma:.3f} (k = 2) by the frames' noise; blur makes an exponent up to some 1 % low"),
+            ("exponent", f"{exponent} (k = 2) left in this capture (1: the light is linear)"),
+            ("+-", "by the frames' noise alone; blur makes an exponent up to some 1 % low"),
             ("ripple", f"{found.ripple_px:.3f} projector px rms in this capture"),
             ("misfit", f"{found.misfit_before:.2%} of the fringes, {found.misfit_after:.2%} with this exponent"),
             ("gamma to undo", projected or "the table used, followed by light ^ (1 / exponent)"),
         ]
     fits = "an exponent fits" if "gamma" in found.response else "no exponent fits: a table"
+    gamma = with_uncertainty(found.gamma, 2 * found.sigma)
     return [
-        ("gamma", f"{found.gamma:.4f} +- {2 * found.sigma:.4f} (k = 2), with {found.misfit:.2%} of white left: {fits}"),
+        ("gamma", f"{gamma} (k = 2), with {found.misfit:.2%} of white left: {fits}"),
         ("levels", f"{len(found.levels)}, seen by {found.pixels:,} pixels"),
     ]
 

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from scanner.digits import rounded, with_uncertainty
+from scanner.stated_length import dominates, stated_length_of
 from service.commands.options import AsJson, output_path
 from service.terminal import print_error, print_facts, print_json, print_table, progress_lines
 
@@ -157,8 +159,31 @@ def report(
         _show(solution, content, output, drawing)
         for one in solution.left_out:
             print_error(f"left out {one.name}: {one.reason}", label="warning")
-    for warning in solution.warnings:
+    for warning in _warnings(solution, content):
         print_error(warning, label="warning")
+    if (hint := dominates(_length_in_translation(solution, content))) is not None:
+        print_error(hint, label="note")
+
+
+def _warnings(solution: Solution, content: dict[str, Any]) -> list[str]:
+    unverified = (
+        "scale unverified: no length was stated, so that all lengths are as right as the target's stated size",
+        "measure its longest row of points: --length MM:SIGMA",
+    )
+    return [*solution.warnings, *([": ".join(unverified)] if content["scale"] == "unverified" else [])]
+
+
+def _length_in_translation(solution: Solution, content: dict[str, Any]) -> dict[str, float] | None:
+    """The stated length and its share of the baseline's variance; None where there is none, or no covariance."""
+    length, shift = stated_length_of(content["scale"]), solution.state.translation
+    if length is None or content["covariance"] is None:
+        return None
+    from scanner.calibration.problem import SHIFT  # noqa: PLC0415
+
+    baseline = math.hypot(*shift)
+    variance = float(shift @ solution.adjusted.covariance[SHIFT, SHIFT] @ shift) / baseline**2
+    share = length.share(baseline, math.sqrt(max(variance, 0.0)))
+    return {"reference_mm": length.reference_mm, "sigma_mm": length.sigma_mm, "share": share}
 
 
 def _document(solution: Solution, content: dict[str, Any], output: Path, drawing: Path | None) -> dict[str, Any]:
@@ -168,7 +193,7 @@ def _document(solution: Solution, content: dict[str, Any], output: Path, drawing
         "calibration": content,
         "views": content["residuals"]["views"],
         "left_out": [{"name": one.name, "reason": one.reason} for one in solution.left_out],
-        "warnings": list(solution.warnings),
+        "warnings": _warnings(solution, content),
     }
 
 
@@ -197,7 +222,12 @@ def _facts(
             )
         )
     shift, s = state.translation, spread["translation"]
-    facts.append(("translation", ", ".join(_stated(v, e, 3) for v, e in zip(shift, s, strict=True)) + " mm"))
+    scale = content["scale"]
+    relative = "; relative to the target's stated size: scale unverified" if scale == "unverified" else ""
+    told = ", ".join(_stated(v, e) for v, e in zip(shift, s, strict=True))
+    facts.append(("translation", f"{told} mm{relative}"))
+    if content["covariance"] is not None:
+        facts.append(("+-", "expanded uncertainty, k = 2, of each of these figures and of the scale's length"))
     residuals = content["residuals"]
     for name, of in (
         ("camera", "distances of points seen from points predicted"),
@@ -206,19 +236,18 @@ def _facts(
     ):
         facts.append((f"rms {name}", f"{residuals[f'{name}_px']:.4f} px: {of}"))
     facts.append(("outliers", f"{residuals['outliers']} points, in none of these figures"))
-    scale = content["scale"]
     facts.append(
-        ("scale", "scale unverified: no length was stated (--length)")
+        ("scale", "unverified: no length was stated (--length)")
         if scale == "unverified"
-        else ("scale", f"rests on {scale['reference_mm']:g} +- {scale['sigma_mm']:g} mm")
+        else ("scale", f"rests on {with_uncertainty(scale['reference_mm'], 2 * scale['sigma_mm'])} mm (k = 2)")
     )
     facts.append(("file", output))
     return facts if drawing is None else [*facts, ("picture", drawing)]
 
 
-def _stated(value: float, sigma: float, digits: int = 2) -> str:
-    """A value with its 1-sigma, where that is known."""
-    return f"{value:.{digits}f}" + ("" if math.isnan(sigma) else f" +- {sigma:.{digits}f}")
+def _stated(value: float, sigma: float) -> str:
+    """A value with its expanded uncertainty, k = 2, of its 1-sigma; without where that is not known."""
+    return rounded(value, 3) if math.isnan(sigma) else with_uncertainty(value, 2 * sigma)
 
 
 def _cell(value: Any) -> str:

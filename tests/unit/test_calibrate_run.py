@@ -280,10 +280,9 @@ def test_the_response_is_measured_before_the_first_pose(monkeypatch: pytest.Monk
         'device = "quick/board"\n'
     )
     config, stages = load_rig(str(file)), list[str]()
-    assert (
-        "which agrees with the rig's calibration (gamma 2.3000)"
-        in first_response(config, VirtualClock(), stages.append)[1]
-    )
+    words = first_response(config, VirtualClock(), stages.append)[1]
+    assert "which agrees with the rig's calibration (gamma 2.3000)" in words
+    assert " (k = 2), by " in words
     claims = SimpleNamespace(precorrection=Precorrection(gamma=1.8))
     monkeypatch.setattr("service.scan_setup.OpenRig.known", claims)
     found, words = first_response(config, VirtualClock(), stages.append)

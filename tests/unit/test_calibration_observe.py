@@ -210,7 +210,9 @@ def test_command_shows_views_and_warnings(poses: Path, tmp_path: Path, capsys: p
     words = ["calibrate", "solve", *some, "--target", SPEC, "-o", str(tmp_path / "rig.json"), "--no-picture"]
     assert main(words) == 0
     shown = capsys.readouterr()
-    assert "scale unverified" in shown.out
+    assert "relative to the target's stated size: scale unverified" in " ".join(shown.out.split())
+    assert "expanded uncertainty, k = 2" in " ".join(shown.out.split())
+    assert "warning: scale unverified: no length was stated" in " ".join(shown.err.split())
     assert "p04" in shown.out
     assert "left out late" in shown.err
     assert not (tmp_path / "rig.png").exists()

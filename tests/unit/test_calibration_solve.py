@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,8 +18,10 @@ from scanner.calibration.pictures import HEAD_PX, draw
 from scanner.calibration.problem import POSES, Problem, State, View
 from scanner.calibration.solve import Solution, SolveOptions, sigmas, solve, thinned
 from scanner.calibration.targets import parse_target
+from scanner.digits import with_uncertainty
 from scanner.errors import CalibrationError
 from scanner.geometry import Calibration, calibration_from_dict
+from service.commands.calibrate_solve import report
 from tests.unit.calibration_bench import TARGET, made_up_rig, observations, poses, view_of
 
 RIG = made_up_rig()
@@ -120,11 +123,17 @@ def test_stretched_sheet_is_found() -> None:
     assert found.state.translation == pytest.approx(RIG.translation, abs=0.3)
 
 
-def test_scale_is_the_stated_length_or_unverified(solution: Solution) -> None:
+def test_scale_is_the_stated_length_or_unverified(solution: Solution, capsys: pytest.CaptureFixture[str]) -> None:
     plain = calibration_dict(calibrate(TARGET, observations(RIG, poses(6)), SolveOptions(rigid=True)))
     assert plain["scale"] == "unverified"
     stated = calibration_dict(solution)
     assert stated["scale"] == {"reference_mm": 240.0, "sigma_mm": 0.01}
+    report(solution, stated, Path("rig.json"), None, as_json=False)
+    shown = capsys.readouterr().out
+    assert "rests on 240.000 +- 0.020 mm (k = 2)" in shown
+    twice = 2 * sigmas(solution.adjusted)["camera"][0]
+    assert f"focal {with_uncertainty(solution.state.camera.matrix[0, 0], twice)}, " in shown
+    assert "unverified" not in shown
     longer = calibrate(TARGET, observations(RIG, poses(6)), SolveOptions(length=(240.48, 0.01)))
     assert np.linalg.norm(longer.state.translation) == pytest.approx(1.002 * np.linalg.norm(RIG.translation), rel=5e-4)
     # A scale that nobody verified is a thousandth unsure, and the translation says so.
