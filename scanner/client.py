@@ -291,16 +291,20 @@ class Client:
         """End the daemon; scans under way are cancelled."""
         self.call("shutdown")
 
-    def call(self, method: str, **params: Any) -> Any:
+    def call(self, method: str, /, **params: Any) -> Any:
         """Any method by name. Raises the daemon's error as its class."""
         return self._run(single(Call(method, params)))
 
     def _run(self, procedure: Procedure[_T]) -> _T:
-        outcome: Any = None
         try:
+            wanted = next(procedure)
             while True:
-                wanted = procedure.send(outcome)
-                outcome = self._exchange(wanted) if isinstance(wanted, Call) else self._exchange_all(wanted)
+                try:
+                    outcome = self._exchange(wanted) if isinstance(wanted, Call) else self._exchange_all(wanted)
+                except ScannerError as error:
+                    wanted = procedure.throw(error)
+                else:
+                    wanted = procedure.send(outcome)
         except StopIteration as stop:
             result: _T = stop.value
             return result

@@ -240,19 +240,23 @@ class AsyncClient:
         """End the daemon."""
         await self.call("shutdown")
 
-    async def call(self, method: str, **params: Any) -> Any:
+    async def call(self, method: str, /, **params: Any) -> Any:
         """Any method by name. Raises the daemon's error as its class."""
         return await self._run(single(Call(method, params)))
 
     async def _run(self, procedure: Procedure[_T]) -> _T:
-        outcome: Any = None
         try:
+            wanted = next(procedure)
             while True:
-                wanted = procedure.send(outcome)
-                if isinstance(wanted, Call):
-                    outcome = await self._exchange(wanted)
+                try:
+                    if isinstance(wanted, Call):
+                        outcome: Any = await self._exchange(wanted)
+                    else:
+                        outcome = await asyncio.gather(*(self._exchange(call) for call in wanted))
+                except ScannerError as error:
+                    wanted = procedure.throw(error)
                 else:
-                    outcome = await asyncio.gather(*(self._exchange(call) for call in wanted))
+                    wanted = procedure.send(outcome)
         except StopIteration as stop:
             result: _T = stop.value
             return result

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import uuid
 from collections.abc import Callable, Generator, Mapping
@@ -71,9 +72,10 @@ class Call:
 
 
 _T = TypeVar("_T")
+_log = logging.getLogger(__name__)
 Procedure = Generator[Call | tuple[Call, ...], Any, _T]
 """Yields calls, one after another, and takes their results. Of a tuple, which are made at once, it takes a list of
-results in their order; results that are bytes are then views."""
+results in their order; results that are bytes are then views. What a call fails with is raised where it was yielded."""
 
 
 class _Raw(msgspec.Struct):
@@ -256,6 +258,8 @@ def fetch(
 ) -> Procedure[Path]:
     """Bring all of a scan's files: each is checked against its digest and appears whole or not at all.
 
+    Then the scan is acknowledged. Where that fails the files are here all the same: it is logged as a warning.
+
     Args:
         job_id: the job.
         folder: where the files go; it is made.
@@ -275,7 +279,10 @@ def fetch(
     for entry in files:
         yield from _fetch_file(job_id, entry, _target(folder, entry.name), on_progress, before, total)
         before += entry.bytes
-    yield Call("scan.acknowledge", {"id": job_id})
+    try:
+        yield Call("scan.acknowledge", {"id": job_id})
+    except ScannerError as error:
+        _log.warning("scan %s is fetched, but not acknowledged: the daemon keeps its files (%s)", job_id, error)
     return folder
 
 
