@@ -376,10 +376,12 @@ def _dwell(
             f"a dwell of {asked} refreshes of {_ms(projector.refresh_ns)} is too short: {what} take {_ms(needed)}",
             hint=f"set dwell to {least} or more, or shorten the exposure",
         )
-    why["dwell"] = f"{what} take {_ms(needed)} of {_ms(projector.refresh_ns)} refreshes" + (
-        "; longer by the rig file" if asked is not None and asked > least else ""
+    dwell = asked or least
+    refreshes = "one refresh" if dwell == 1 else f"{dwell} refreshes"
+    why["dwell"] = f"{what} take {_ms(needed)}: {refreshes} of {_ms(projector.refresh_ns)}" + (
+        ", longer by the rig file" if dwell > least else ""
     )
-    return asked or least
+    return dwell
 
 
 def _ms(ns: float) -> str:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from service.commands.options import AsJson
-from service.terminal import print_json, print_table
+from service.terminal import print_json, print_table, progress_lines
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,7 +25,9 @@ def devices(as_json: AsJson = False) -> int:
     """
     from drivers import registry  # noqa: PLC0415
 
-    found = registry.discover()
+    with progress_lines() as lines:
+        lines.stage("looking for devices, by every driver")
+        found = registry.discover()
     if as_json:
         print_json({"devices": [asdict(device) for device in found]})
         return 0

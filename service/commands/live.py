@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from scanner.live import LiveFrame
 
 LINE_S = 1.0
+FIRST_S = 0.1
 """The line and the picture are made anew this often."""
 
 CLOSE_S = 600.0
@@ -194,6 +195,11 @@ class _Watching:
             run = self._client.live_status()
             if run is None:
                 return
+            if (
+                run["live"]["latency_ms"]["p50"] is None and not run["live"]["problem"]
+            ):  # the first result is here before the first figures
+                self._next = time.monotonic() + FIRST_S
+                continue
             self.sent = sent_points(frame)
             line(figures(run["live"], self.sent))
             if self._picture is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -87,5 +88,7 @@ def gige(
         else:
             piece = f'camera = {{ driver = "aravis", device = "{address}" }}'
             print_facts("simulated GigE Vision cameras", [*service.facts, ("in a rig file", piece), ("end", "Ctrl-C")])
-        while True:  # until a signal's exception
-            threading.Event().wait(3600.0)
+        with suppress(KeyboardInterrupt):  # Ctrl-C is how it is ended
+            while True:
+                threading.Event().wait(3600.0)
+    return 0

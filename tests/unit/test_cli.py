@@ -5,8 +5,11 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -144,6 +147,23 @@ def test_a_closed_pipe_is_no_error() -> None:
     assert (ran.returncode, ran.stderr) == (1, "")
 
 
+@pytest.mark.parametrize("words", [("--version",), ("--help",), ("check-config", "simulated", "--json")])
+def test_output_that_cannot_be_written_is_said_and_no_bug(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with open("/dev/full", "w", encoding="utf-8") as full, monkeypatch.context() as redirected:  # noqa: PTH123
+        redirected.setattr(sys, "stdout", full)
+        assert main(words) == 1
+    err = capsys.readouterr().err
+    assert err.startswith("error: cannot write to standard output: No space left on device\n")
+    assert "bug" not in err
+
+
+def test_closed_streams_lead_nowhere() -> None:
+    line = f"{sys.executable} -m service.cli check-config simulated --json <&- >&- 2>&-"
+    assert subprocess.run(["/bin/sh", "-c", line], check=False, timeout=60).returncode == 0
+
+
 def test_the_command_line_starts_without_array_libraries() -> None:
     heavy = (
         "import sys, service.program; print(sorted({'numpy', 'numba', 'cv2', 'zmq', 'pydantic'} & set(sys.modules)))"
@@ -174,7 +194,8 @@ def test_devices_lists_the_simulated_rigs_and_a_driver_that_cannot_look_costs_on
     monkeypatch.setattr(registry, "driver_names", lambda kind: ["no-such-driver", "simulated"])
     status, out, err = run("devices", "--json")
     found = json.loads(out)["devices"]
-    assert (status, err) == (0, "")
+    assert status == 0
+    assert "looking for devices" in err
     assert {device["driver"] for device in found} == {"simulated"}
     assert {"camera", "projector"} <= {device["kind"] for device in found}
     assert "no-such-driver cannot look for devices" in caplog.text
@@ -187,7 +208,22 @@ def test_devices_prints_the_piece_of_a_rig_file(run: Run, monkeypatch: pytest.Mo
     assert status == 0
     assert '[camera]\ndriver = "aravis"\ndevice = "maker-42"' in out
     monkeypatch.setattr("drivers.registry.discover", list)
-    assert "fringed doctor" in run("devices")[1]
+    status, out, err = run("devices")
+    assert "fringed doctor" in out
+    assert "looking for devices" in err, "it takes seconds"
+
+
+def test_ctrl_c_is_the_normal_end_of_a_simulated_camera(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(self: threading.Event, timeout: float) -> bool:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(
+        registry, "load_simulator", lambda name: lambda *_, **__: nullcontext(SimpleNamespace(facts=[]))
+    )
+    monkeypatch.setattr(threading.Event, "wait", interrupted)
+    status, out, err = run("simulate", "gige")
+    assert (status, err) == (0, "")
+    assert "Ctrl-C" in out
 
 
 def test_devices_prints_a_rig_file_of_simulated_ones(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

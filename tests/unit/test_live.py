@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from scanner.sequencer import Rig, endless
 from scanner.series import read_series, recording_at, segment_name
 from scanner.stream import LiveBegin, LiveCounts, LiveFrame
 from scanner.wire_images import LiveHeader, encode_image
+from service.commands import live as live_command
 from service.commands.live import figures, sent_points
 from service.live_files import close_recording, reserve
 from service.live_series import LiveSeries, LiveTotals
@@ -394,6 +396,22 @@ def test_frames_without_a_pattern_are_results_with_words(work: tuple[LiveWork, l
 
 
 # --- the terminal -------------------------------------------------------------------------------------------------
+
+
+def test_the_line_waits_until_there_are_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_command, "FIRST_S", 0.0)
+    run: dict[str, Any] = dict.fromkeys(("frames_per_s", "results_per_s", "dropped", "lost", "points"), 1)
+    run |= {"retain": "none", "problem": None}
+    latencies: list[float | None] = [None, None, 24.0]
+    client = SimpleNamespace(
+        live_status=lambda: {"live": {**run, "latency_ms": {"p50": latencies[0], "p99": latencies.pop(0)}}}
+    )
+    lines: list[str] = []
+    watching = live_command._Watching(client, None, lambda: None)  # type: ignore[arg-type]  as far as it asks
+    frame = client_live.LiveFrame(head(1, content="rows", width=2, height=1), np.zeros((1, 2), np.uint16), 0)
+    watching.all(iter([frame] * 3), lines.append)
+    assert len(lines) == 1
+    assert "latency 24 ms" in lines[0]
 
 
 def test_the_line_counts_the_points_that_are_sent() -> None:
