@@ -26,6 +26,7 @@ os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
+    _open_streams()
     words = list(sys.argv[1:] if arguments is None else arguments)
     # Both belong to the whole program: they hold wherever they stand.
     debug, as_json = "--debug" in words, "--json" in words
@@ -39,6 +40,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return run(words, debug=debug, as_json=as_json)
     except KeyboardInterrupt:  # again, while the first one was being answered
         return INTERRUPTED
+
+
+def _open_streams() -> None:
+    """Streams that the caller closed (>&-) lead nowhere: else the next file opened would take one's number."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free: this one
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
 
 
 @contextmanager

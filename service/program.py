@@ -18,6 +18,7 @@ from typing import Annotated, Any
 import typer
 
 from scanner.errors import ScannerError, StorageError
+from scanner.storage import storage_errors
 from service.commands import (
     audit,
     calibrate,
@@ -82,10 +83,13 @@ def run(words: list[str], *, debug: bool, as_json: bool) -> int:
     try:
         return _flushed(_run(words, as_json))
     except BrokenPipeError:
-        # The reader has what it wanted (fringed ... | head). Python must not write there again when it exits.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _leave_output()  # the reader has what it wanted (fringed ... | head)
         return FAILED
     except Exception as error:  # noqa: BLE001  (the last line of defence: a bug is reported, not shown as a traceback)
+        if isinstance(error, OSError) and (fault := _output_fault(error)) is not None:
+            _leave_output()
+            print_error(str(fault), fault.hint)
+            return FAILED
         _report_bug(error, debug=debug, as_json=as_json)
         return FAILED
 
@@ -145,6 +149,23 @@ def _interrupted(as_json: bool) -> int:
 def _flushed(status: int) -> int:
     sys.stdout.flush()
     return status
+
+
+def _output_fault(error: OSError) -> StorageError | None:
+    """What is wrong with standard output, if that is where the error comes from."""
+    try:
+        with storage_errors(Path("cannot write to standard output")):
+            sys.stdout.flush()  # what could not be written still waits in there, and fails again
+            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) and error.filename is None:
+                raise error  # with PYTHONUNBUFFERED nothing waits; files of ours have their own errors
+    except StorageError as fault:
+        return fault
+    return None
+
+
+def _leave_output() -> None:
+    """Standard output leads nowhere from now on: Python must not fail there again when it exits."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _report_bug(error: Exception, *, debug: bool, as_json: bool) -> None:
