@@ -92,6 +92,39 @@ def point_spread(calibration: Calibration, pixels: Array, xyz: Array, axis: str)
     return PointSpread(slopes, read.matrix)
 
 
+def across_spread(calibration: Calibration, pixels: Array, depth: Array, axis: str) -> Array | None:
+    """1-sigma, px, of where along the other axis the projector sees points whose coordinate along `axis` was measured.
+
+    Args:
+        pixels: (n, 2) px of the camera. depth: (n,) mm, of the points seen there.
+
+    Returns:
+        (n,); None where the calibration has no covariance that can be used.
+    """
+    try:
+        read = read_covariance(calibration.extra.get("covariance"))
+    except ValueError:  # said when the file was read
+        return None
+    if read is None:
+        return None
+    other = "x" if axis == "y" else "y"
+
+    def slopes(up: Calibration, down: Calibration, higher: Array, lower: Array) -> tuple[Array, Array]:
+        along, across = (_seen(up, pixels, higher, a) - _seen(down, pixels, lower, a) for a in (axis, other))
+        return along, across
+
+    # The measured coordinate stays, so what moves it moves the depth back, and with that the other coordinate.
+    along, across = slopes(calibration, calibration, depth * 1.0005, depth * 0.9995)
+    slant = across / along
+    moves = np.zeros((len(pixels), len(read.names)))
+    for k, (name, sigma) in enumerate(zip(read.names, np.sqrt(np.clip(np.diag(read.matrix), 0, None)), strict=True)):
+        if sigma > 0:
+            along, across = slopes(moved(calibration, name, sigma), moved(calibration, name, -sigma), depth, depth)
+            moves[:, k] = (across - slant * along) / (2 * sigma)
+    variance = np.einsum("ni,ij,nj->n", moves, read.matrix, moves)
+    return np.asarray(np.sqrt(np.clip(variance, 0, None)), dtype=np.float64)
+
+
 def _rays(rig: Calibration, pixels: Array) -> Array:
     """(n, 3): x / z, y / z, 1 of what is seen at camera pixels."""
     return np.concatenate([rig.camera.normalised(pixels), np.ones((len(pixels), 1))], axis=1)

@@ -46,7 +46,7 @@ def along_stripe(calibration: Calibration, axis: Axis, values: NDArray[np.float3
     Returns:
         (H, W) float64 px; NaN where there is no value or no point.
     """
-    xyz = triangulate(calibration, **{"rows" if axis == "y" else "columns": values}).xyz
+    xyz = triangulate(calibration, rows=values if axis == "y" else None, columns=None if axis == "y" else values).xyz
     seen = calibration.projector.project(calibration.to_projector(xyz))
     found: Array = seen[..., 0 if axis == "y" else 1]
     return found

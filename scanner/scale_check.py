@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scanner.decode import Decoded, Reason
 from scanner.errors import DecodeError
 from scanner.geometry import Array, Calibration
+from scanner.lit_check import require_lit
 from scanner.orientation import require_orientation
 from scanner.patterns import GrayPattern, GrayPmpPattern, PatternSequence, PmpPattern
 from scanner.patterns.description import Axis
@@ -80,7 +81,8 @@ class Reading:
 
 
 def require_geometry(decoded: Decoded, calibration: Calibration, sequence: PatternSequence) -> Decoded:
-    """Check decoded maps against the rig: which way coordinates run (`scanner.orientation`), and at what pace.
+    """Check decoded maps against the rig: which way coordinates run (`scanner.orientation`), at what pace, and whether
+    points lie where the projector can light (`scanner.lit_check`).
 
     Returns:
         The same maps; warnings where a part contradicts, and in `details` what the coordinates mean by "geometry".
@@ -100,7 +102,9 @@ def require_geometry(decoded: Decoded, calibration: Calibration, sequence: Patte
         if calibration.phase_axis == axis:
             typical = 0.0 if sigma is None else _median(sigma)
             reading = require_scale(calibration, sequence, values, typical, axis)
-            readings[axis] = None if reading is None else reading.as_dict()
+            lit, unlit = require_lit(calibration, values, sigma, axis)
+            readings[axis] = None if reading is None else {**reading.as_dict(), "outside": lit.share}
+            warnings += [] if unlit is None else [unlit]
     details = {**decoded.details, "geometry": readings}
     return replace(decoded, details=details, warnings=(*decoded.warnings, *warnings))
 

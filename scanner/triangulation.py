@@ -45,6 +45,7 @@ def triangulate(
     columns: Map | None = None,
     sigma_rows: Map | None = None,
     sigma_columns: Map | None = None,
+    every: int = 1,
 ) -> Triangulated:
     """Depth along each camera ray at which the projector sees the measured row and/or column.
 
@@ -52,6 +53,7 @@ def triangulate(
         calibration: the rig.
         rows, columns: (H, W) float32 projector coordinates, px; NaN = not measured. At least one of them.
         sigma_rows, sigma_columns: (H, W) float32 px. Without them both axes weigh alike, and sigma_z is NaN.
+        every: triangulate each line's and column's every-th pixel only; the result is as much smaller.
 
     Raises:
         CalibrationError: maps of another size than the calibration's camera, or an axis that measures no depth here.
@@ -69,10 +71,11 @@ def triangulate(
         )
     if len(given) == 1:
         require_depth_axis(calibration, given[0][1])
-    xyz = np.empty((height, width, 3), np.float32)
-    sigma_z = np.empty((height, width), np.float32)
-    rays = camera_rays(calibration.camera)
-    row, column, sigma_row, sigma_column = map(_or_empty, (rows, columns, sigma_rows, sigma_columns))
+    rays = _every(camera_rays(calibration.camera), every)
+    xyz = np.empty((*rays[0].shape, 3), np.float32)
+    sigma_z = np.empty(rays[0].shape, np.float32)
+    sampled = (m if m is None else m[::every, ::every] for m in (rows, columns, sigma_rows, sigma_columns))
+    row, column, sigma_row, sigma_column = map(_or_empty, sampled)
     if columns is None:
         impossible = along_rows(*rays, row, sigma_row, _projector_numbers(calibration), xyz, sigma_z)
     elif rows is None and calibration.projector.matrix[0, 1] == 0:
@@ -156,6 +159,14 @@ def _rays(size: tuple[int, int], matrix: tuple[float, ...], distortion: tuple[fl
     rays = lens.normalised(lens.pixel_grid())
     x, y = np.ascontiguousarray(rays[..., 0]), np.ascontiguousarray(rays[..., 1])
     x.flags.writeable = y.flags.writeable = False
+    return x, y
+
+
+def _every(rays: tuple[Array, Array], every: int) -> tuple[Array, Array]:
+    if every == 1:
+        return rays
+    x, y = (np.ascontiguousarray(ray[::every, ::every]) for ray in rays)
+    x.flags.writeable = y.flags.writeable = False  # as all rays are: the kernels are compiled for these
     return x, y
 
 
