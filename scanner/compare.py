@@ -209,22 +209,27 @@ def _picture(comparison: Comparison) -> Picture:
     left, top = x + (width - w) // 2, y + (height - h) // 2
     picture[top : top + h, left : left + w] = small
     colour_bar(picture, scale, (x + width + 30, y + 40, 18, height - 60))
-    text(picture, "Error against truth", (x, 46), size=26, weight=600)
-    text(picture, _caption(comparison), (x, 78), size=17, colour=DIM)
+    text(picture, "Error against truth", (x, 40), size=26, weight=600)
+    for at, line in zip((64, 86), captions(comparison), strict=False):
+        text(picture, line, (x, at), size=16, colour=DIM)
     picture[60:76, 1180:1196] = _UNDECIDED
     text(picture, "lit (truth), undecided", (1206, 74), size=15, colour=DIM)
     return picture
 
 
-def _caption(comparison: Comparison) -> str:
-    inner = comparison.inside
-    errors = inner.depth_mm or inner.rows_px or inner.columns_px
+def captions(comparison: Comparison) -> tuple[str, ...]:
+    """What stands over the picture: a line of figures for each set of pixels, which it names first."""
+    sets = (("all that is lit", comparison.lit), (f"{INSIDE_PX} px and more from edges", comparison.inside))
+    return tuple(_caption(name, region, comparison.unit) for name, region in sets)
+
+
+def _caption(name: str, region: Region, unit: str) -> str:
+    errors = region.depth_mm or region.rows_px or region.columns_px
     if errors is None or errors.rms is None:
-        return "nothing to compare"
+        return f"{name}: nothing to compare"
     return (
-        f"inside: rms {errors.rms:.3f} {comparison.unit}, 99 % below {errors.p99:.3f} {comparison.unit}, "
-        f"{grouped(inner.wrong)} wrong of {grouped(inner.decided)};  "
-        f"{100 * comparison.lit.coverage:.2f} % of what is lit (truth)"
+        f"{name}: rms {errors.rms:.3f} {unit}, 99 % below {errors.p99:.3f} {unit}, "
+        f"{grouped(region.wrong)} wrong of {grouped(region.decided)} decided ({100 * region.coverage:.2f} %)"
     )
 
 

@@ -26,6 +26,7 @@ from scanner.colours import (
     text,
     text_width,
 )
+from scanner.digits import alone
 from scanner.render import View, render
 
 if TYPE_CHECKING:
@@ -80,25 +81,35 @@ def _title(picture: Picture, scan: Scan) -> None:
     x = _MARGIN + width + 28
     cv2.line(picture, (x, 28), (x, 60), LINE, 1)
     x += 28
-    for words, caption in _figures(scan):
+    for words, caption in figures(scan):
         end = text(picture, words, (x, 48), size=24, weight=500)
         x += end + 9
         x += text(picture, caption, (x, 48), size=17, colour=DIM) + 32
 
 
-def _figures(scan: Scan) -> list[tuple[str, str]]:
+def figures(scan: Scan) -> list[tuple[str, str]]:
     """Number and what it is, for the title."""
     count = int(np.count_nonzero(scan.valid))
-    figures = [(grouped(count), "points" if scan.xyz is not None else "pixels decoded")]
+    told = [(grouped(count), "points" if scan.xyz is not None else "pixels decoded")]
     if (lit := int(np.count_nonzero(scan.lit))) > 0:
         share = count / lit if scan.xyz is not None else scan.coverage
-        figures.append((f"{100 * share:.1f} %", "of where the pattern shows"))
+        told.append((f"{100 * share:.1f} %", "of where the pattern shows"))
     if scan.xyz is not None and (depth := _sample(scan.xyz[..., 2])).size:
         low, high = np.percentile(depth, (1, 99))
-        figures.append((f"{grouped(low)} … {grouped(high)}", "mm depth"))
+        told.append((f"{grouped(low)} … {grouped(high)}", "mm depth (1st to 99th percentile)"))
+    return [*told, *_uncertainty(scan)]
+
+
+def _uncertainty(scan: Scan) -> list[tuple[str, str]]:
+    """What the terminal says, where the scan has a budget; and the random part of it, k = 2 too."""
+    told = []
+    budget = scan.report.get("uncertainty") or {}
+    if (within := budget.get("within_mm")) is not None:
+        least = "at least " if "method" in budget.get("unknown", ()) else ""
+        told.append((f"{least}± {alone(within)}", "mm for 95 % of points"))
     if scan.sigma_z is not None and (sigma := _sample(scan.sigma_z)).size:
-        figures.append((f"{np.median(sigma):.3f}", "mm random error (median σ)"))
-    return figures
+        told.append((f"± {alone(2 * float(np.median(sigma)))}", "mm random (k = 2)"))
+    return told
 
 
 def _sample(values: NDArray[Any]) -> NDArray[Any]:

@@ -32,6 +32,7 @@ from scanner.patterns import (
 )
 from scanner.patterns.sequence import Precorrection
 from scanner.scan import Scan
+from scanner.stated_length import StatedLength, stated_length_of
 
 COVERAGE_FACTOR = 2.0
 """Of the expanded uncertainty: 95 % of a normal error."""
@@ -64,6 +65,8 @@ class Budget:
     contributions: tuple[Contribution, ...]
     spread_mm: NDArray[np.float32]
     """(n,) sigmas of points, a sample: in dark and oblique places they are many times their median"""
+    stated: StatedLength | None = None
+    """what the calibration's scale rests on, where its covariance is one of the contributions"""
 
     @property
     def within_mm(self) -> float:
@@ -108,7 +111,13 @@ class Budget:
             "coverage_factor": COVERAGE_FACTOR,
             "within_mm": self.within_mm,
             "unknown": list(self.unknown),
+            "stated_length": self._of_stated(),
         }
+
+    def _of_stated(self) -> dict[str, float] | None:
+        if self.stated is None:
+            return None
+        return {**asdict(self.stated), "share": self.stated.share(self.depth_mm, self.combined_mm)}
 
 
 _CROSS_TALK = Contribution(
@@ -154,8 +163,9 @@ def budget_of(
     method = [says for kind, says in _METHODS.items() if isinstance(sequence.pattern, kind)]
     causes = (noise, *light, *method, _sync(sequence, mixed, axis))
     contributions = [_in_mm(cause, per_px) for cause in causes]
-    contributions.insert(1, _calibration(scan, calibration, axis))
-    return Budget(float(np.median(depth[known])), tuple(contributions), mm[known])
+    contributions.insert(1, of_rig := _calibration(scan, calibration, axis))
+    stated = None if of_rig.mm is None else stated_length_of(calibration.extra.get("scale"))
+    return Budget(float(np.median(depth[known])), tuple(contributions), mm[known], stated)
 
 
 def _of_points(sequence: PatternSequence, px: float, mm: float, repeat: int) -> Contribution:

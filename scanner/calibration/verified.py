@@ -32,6 +32,7 @@ from scanner.capture import Capture
 from scanner.errors import DecodeError, ScannerError
 from scanner.geometry import Calibration, load_calibration
 from scanner.scan import Scan
+from scanner.stated_length import stated_length_of
 
 SAME_PX = 0.05
 """Projector px by which points may miss their coordinates under the scan's own calibration: float32 leaves a
@@ -80,6 +81,7 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
         found["length"]["uncertainty"] = {"error_mm": of_length, "measured_mm": of_length}
     if found:
         found["coverage_factor"], found["unknown"] = COVERAGE_FACTOR, why
+        found["stated_length"] = None if rig is None or why is not None else _of_stated(found, rig)
     if wanted.edge is not None:
         x, y, width, height = wanted.edge
         found["edge"] = plain(edge_width(scan.xyz[y : y + height, x : x + width]))
@@ -141,6 +143,19 @@ def _of_noise(on: FeaturePoints, scan: Scan, name: str) -> dict[str, Any]:
         return {"noise_mm": None}
     figures = board_figures if name == "flatness_mm" else sphere_figures
     return {"noise_mm": noise_alone(on, scan.sigma_z, figures, round_=name == "form_mm")[name]}
+
+
+def _of_stated(found: dict[str, Any], rig: Rig) -> dict[str, float] | None:
+    """The calibration's stated length, and the largest share that it has of a figure's variance."""
+    stated = stated_length_of(rig.calibration.extra.get("scale"))
+    if stated is None:
+        return None
+    shares = [
+        stated.share(found[kind][name], found[kind]["uncertainty"][name]["expanded"] / COVERAGE_FACTOR)
+        for kind, name in (("flat", "distance_mm"), ("sphere", "diameter_mm"), ("length", "measured_mm"))
+        if kind in found and found[kind]["uncertainty"][name]["expanded"] is not None
+    ]
+    return {"reference_mm": stated.reference_mm, "sigma_mm": stated.sigma_mm, "share": max(shares, default=0.0)}
 
 
 def _spreads(found: dict[str, Any]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from scanner.digits import alone, rounded, with_uncertainty
+from scanner.stated_length import dominates
 from service.commands.calibrate_marks import region_given
 from service.commands.calibrate_solve import Replace
 from service.commands.options import AsJson, output_path
@@ -291,6 +292,9 @@ def _show(document: dict[str, Any]) -> None:
             facts.append(("+-", f"{_of_uncertainty(one)}: {one['scan']}"))
         facts.append(("systematic", f"{_of_systematic(one['systematic_besides'])}: {one['scan']}"))
     print_facts("verification", facts)
+    for hint in dict.fromkeys(dominates(one.get("stated_length")) for one in document["scans"]):
+        if hint is not None:
+            print_error(hint, label="note")
 
 
 def _of_repeats(found: dict[str, Any] | None) -> list[tuple[str, str]]:

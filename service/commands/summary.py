@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from scanner.digits import alone
+from scanner.stated_length import dominates
 from service.terminal import print_error, print_facts, print_json
 
 LEAST_S = 0.1
@@ -51,6 +53,8 @@ def report_result(folder: Path, seconds: float, stages: Mapping[str, float], *, 
     print_facts("scan", facts)
     for warning in report.get("warnings") or ():
         print_error(warning, label="warning")
+    if (hint := dominates((report.get("uncertainty") or {}).get("stated_length"))) is not None:
+        print_error(hint, label="note")
 
 
 def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -72,11 +76,21 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     if (rms := error.get("rms")) is not None and (p99 := error.get("p99")) is not None:
         away = f" ({truth['inside_px']} px and more from edges)" if "inside_px" in truth else ""
         facts.append(("depth error", f"{rms:.3f} mm rms, {p99:.3f} mm in 99 of 100 points{away}"))
+        facts += _everywhere(truth.get("lit") or {})
     if (wrong := inside.get("wrong")) is not None:
         everywhere = (truth.get("lit") or {}).get("wrong")
         more = f"; {everywhere:,} with those at edges" if everywhere not in (None, wrong) else ""
         facts.append(("wrong", f"{wrong:,} points off by half a fringe or stripe, or by 20 mm{more}"))
     return facts
+
+
+def _everywhere(lit: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The depth error of all points, with those at edges, where few that are wrong make most of it."""
+    error = lit.get("depth_mm") or {}
+    if (rms := error.get("rms")) is None or (p99 := error.get("p99")) is None:
+        return []
+    wrong = f", {lit['wrong_share']:.2%} of them wrong" if "wrong_share" in lit else ""
+    return [("", f"{rms:.3f} mm rms, {p99:.3f} mm in 99 of 100 points (all that is lit, edges too{wrong})")]
 
 
 def _coverage(report: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -126,15 +140,15 @@ def _uncertainty(budget: Mapping[str, Any]) -> tuple[str, str] | None:
     names = budget.get("unknown") or ()
     unknown = ", ".join(names)
     at = f"at {budget['depth_mm']:.0f} mm"
+    within, random = alone(budget["within_mm"]), alone(2 * budget["random_mm"])
     if "method" in names:  # what is known is the least of it: no figure of the whole
         text = (
-            f"at least +-{budget['within_mm']:.3f} mm {at}, of 95 in 100 points; {budget['random_mm']:.3f} mm is the "
-            "random part alone (1 sigma of the median point); the method's own error is not known and larger: "
-            "see docs/explanation/uncertainty.md"
+            f"at least +-{within} mm {at}, of 95 in 100 points; +-{random} mm is the random part alone (k = 2, the "
+            "median point); the method's own error is not known and larger: see docs/explanation/uncertainty.md"
         )
     else:
         text = (
-            f"+-{budget['within_mm']:.3f} mm {at}, of 95 in 100 points: {budget['random_mm']:.3f} mm random "
-            f"(the median point) and {budget['systematic_mm']:.3f} mm systematic (1 sigma)"
+            f"+-{within} mm {at}, of 95 in 100 points: +-{random} mm random (the median point) and "
+            f"+-{alone(2 * budget['systematic_mm'])} mm systematic (both k = 2)"
         )
     return "uncertainty", f"{text}{f'; unknown, and not in it: {unknown}' if unknown else ''}"

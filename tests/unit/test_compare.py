@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scanner.compare import Errors, compare, inside
+from scanner.colours import grouped, text_width
+from scanner.compare import Errors, captions, compare, inside
 from scanner.devices import Truth
 from scanner.errors import DecodeError
 from scanner.filter_settings import FilterSettings
@@ -109,6 +110,17 @@ def test_the_error_map_shows_where_errors_are(ball, scan):
     flat, marked = (compare(s, ball.truth).picture() for s in (scan, replace(scan, xyz=off)))
     assert flat.dtype == np.uint8
     assert (flat != marked).any()
+
+
+def test_the_error_map_names_the_pixels_of_its_figures(ball, scan):
+    found = compare(scan, ball.truth)
+    said = captions(found)
+    for line, name, region in zip(
+        said, ("all that is lit", "7 px and more from edges"), (found.lit, found.inside), strict=True
+    ):
+        assert line.startswith(f"{name}: rms {region.depth_mm.rms:.3f} mm")
+        assert f" wrong of {grouped(region.decided)} decided ({100 * region.coverage:.2f} %)" in line
+        assert text_width(line, size=16) < 1140, "beside it stands what the colour of undecided pixels is"
 
 
 def test_truth_of_another_camera_is_refused(ball, scan):

@@ -9,7 +9,7 @@ import pytest
 
 from scanner.colours import PANEL, Scale, fit, grouped, scale_of, text, text_width, ticks
 from scanner.filter_settings import FilterSettings
-from scanner.preview import preview_picture
+from scanner.preview import figures, preview_picture
 from scanner.render import View, render
 from scanner.scan import build_scan
 
@@ -33,6 +33,18 @@ def test_four_panels_show_the_scan(scan):
     changed = preview_picture(other)
     assert differs(picture, changed, (1292, 450, 600, 360))
     assert not differs(picture, changed, (1292, 84, 600, 350))
+
+
+def test_the_title_says_what_its_figures_are(scan):
+    with_budget = scan.with_report(uncertainty={"within_mm": 0.1514, "unknown": ["calibration"]})
+    told = {caption: words for words, caption in figures(with_budget)}
+    assert "mm depth (1st to 99th percentile)" in told
+    assert told["mm for 95 % of points"] == "± 0.15"
+    assert float(told["mm random (k = 2)"].removeprefix("± ")) == pytest.approx(
+        2 * np.nanmedian(scan.sigma_z), rel=0.05
+    )
+    of_mcp = scan.with_report(uncertainty={"within_mm": 0.1514, "unknown": ["method"]})
+    assert ("at least ± 0.15", "mm for 95 % of points") in figures(of_mcp)
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])

@@ -40,17 +40,24 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
             "random_mm": 0.07,
             "systematic_mm": 0.0169,
             "unknown": ["calibration"],
+            "stated_length": {"reference_mm": 240.0, "sigma_mm": 0.05, "share": 0.97},
         },
-        "truth": {"inside_px": 7, "inside": {"depth_mm": depth, "wrong": 0}, "lit": {"wrong": 12}},
+        "truth": {
+            "inside_px": 7,
+            "inside": {"depth_mm": depth, "wrong": 0},
+            "lit": {"wrong": 12, "wrong_share": 0.0012, "depth_mm": {"rms": 0.683, "p99": 0.4}},
+        },
     }
     (tmp_path / "report.json").write_text(json.dumps(report), encoding="utf-8")
     report_result(tmp_path, 1.0, {}, as_json=False)
-    printed = capsys.readouterr().out
+    printed, said = capsys.readouterr()
+    assert "note: the stated length 240.00 +- 0.10 mm (k = 2) dominates, with 97% of the variance" in said
     assert "1 of the pattern, 1 white, 1 black, 6 black and white around them that prove the timing, 2 times" in printed
     assert "99.0% of the pixels in which the pattern shows, 20.0% keep a point" in printed
     assert "(7 px and more from edges)" in printed
-    assert "+-0.163 mm at 700 mm, of 95 in 100 points" in printed
-    assert "0.070 mm random (the median point) and 0.017 mm systematic" in printed
+    assert "0.683 mm rms, 0.400 mm in 99 of 100 points (all that is lit, edges too, 0.12% of them wrong)" in printed
+    assert "+-0.16 mm at 700 mm, of 95 in 100 points" in printed
+    assert "+-0.14 mm random (the median point) and +-0.034 mm systematic (both k = 2)" in printed
     assert "unknown, and not in it: calibration" in printed
     assert "0 points off by half a fringe or stripe, or by 20 mm; 12 with those at edges" in printed
 
@@ -81,8 +88,8 @@ def test_what_a_method_adds_unknown_gets_no_figure_of_the_whole(
     (tmp_path / "report.json").write_text(json.dumps(report), encoding="utf-8")
     report_result(tmp_path, 1.0, {}, as_json=False)
     printed = capsys.readouterr().out
-    assert "at least +-0.200 mm at 700 mm, of 95 in 100 points" in printed
-    assert "0.070 mm is the random part alone (1 sigma of the median point)" in printed
+    assert "at least +-0.20 mm at 700 mm, of 95 in 100 points" in printed
+    assert "+-0.14 mm is the random part alone (k = 2, the median point)" in printed
     assert "the method's own error is not known and larger: see docs/explanation/uncertainty.md" in printed
     assert "unknown, and not in it: calibration, method" in printed
 

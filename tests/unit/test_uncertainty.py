@@ -124,6 +124,12 @@ def test_sums_are_those_of_what_is_known(scene):
     assert told["random_mm"] == pytest.approx(by_name["noise"]["mm"])
     assert told["expanded_mm"] == pytest.approx(2 * np.hypot(told["random_mm"], systematic))
     assert told["unknown"] == []
+    assert told["stated_length"] is None
+    stated = with_covariance(scene.calibration, scale={"reference_mm": 240.0, "sigma_mm": 0.05})
+    share = budget_of(scan_of(scene, light=LIGHT, unwrapping=UNWRAPPING), stated, SEQUENCE, 0.1).as_dict()[
+        "stated_length"
+    ]
+    assert share["share"] == pytest.approx(min((told["depth_mm"] * 0.05 / 240 / told["combined_mm"]) ** 2, 1))
     assert told["depth_mm"] == pytest.approx(np.nanmedian(scene.truth.xyz[..., 2][scene.lit]), abs=1)
 
 
