@@ -135,7 +135,8 @@ def save(folder: Path, xyz, sigma, calibration: str) -> None:
     )
     header = CaptureHeader(sequence, CameraFormat(WIDTH, HEIGHT, 8), frames=("0.png",), calibration="calibration.json")
     (folder / "capture" / "capture.json").write_text(json.dumps(header.as_dict()))
-    (folder / "capture" / "calibration.json").write_text(json.dumps(rig()))
+    scale = {"reference_mm": 100.0, "sigma_mm": 100 * SHARE}
+    (folder / "capture" / "calibration.json").write_text(json.dumps(rig(scale=scale)))
 
 
 def test_verify_takes_the_calibration_that_made_the_scan_and_no_other(tmp_path, capsys):
@@ -159,7 +160,8 @@ def test_verify_takes_the_calibration_that_made_the_scan_and_no_other(tmp_path, 
     budget = {"systematic_mm": 0.2813, "contributions": of_budget, "unknown": ["sync"]}
     report.write_text(json.dumps({**json.loads(report.read_text()), "uncertainty": budget}))
     assert main(ask) == 0
-    said = capsys.readouterr().out
+    said, noted = capsys.readouterr()
+    assert "note: the stated length 100.00 +- 0.20 mm (k = 2) dominates, with " in noted
     assert re.search(r"\b0\.\d\d \+- 0\.2\d\b", said), "value and U end at one place"
     # U contains the calibration: only the others are said to be in none of the figures.
     assert "+-0.032 mm of depth (k = 2) besides the calibration, in none of these figures; unknown: sync" in said
