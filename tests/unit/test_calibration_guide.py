@@ -9,9 +9,9 @@ import pytest
 from drivers.simulated.optics import Optics
 from drivers.simulated.rigs import rig
 from drivers.simulated.scenes import SceneOptions, build_scene
-from drivers.simulated.targets import target_poses
+from drivers.simulated.targets import target_points, target_poses
 from drivers.simulated.view import view_scene
-from scanner.calibration.guide import FIELDS, GOOD_POSES, STILL_S, Guide, Seen, Stillness, moved, status
+from scanner.calibration.guide import FIELDS, GOOD_POSES, NEW_SHARE, STILL_S, Guide, Seen, Stillness, moved, status
 from scanner.calibration.guide_picture import HEIGHT, WIDTH, guide_picture
 from scanner.calibration.sight import Sight, edge_width, guessed_matrix, look, standing_of
 from scanner.calibration.targets import parse_target
@@ -196,6 +196,19 @@ def lit() -> np.ndarray:
     view = view_scene(chosen, build_scene("chessboard_poses", SceneOptions(pose=3), chosen, 0), Optics())
     light = cv2.GaussianBlur(view.shade + view.floor, (0, 0), 0.7)  # of a lens
     return np.clip(light / light.max() * 230, 0, 255).astype(np.uint8)
+
+
+def test_the_walk_of_the_guide_meets_what_is_asked_and_each_pose_is_new() -> None:
+    """`calibrate run "simulated:charuco_poses?walk=true&seed=87"`: twelve poses, none of them captured in vain."""
+    lens, board = rig("casey2011").calibration.camera, parse_target("charuco:10x7:30")
+    points = target_points("charuco_poses", rig("casey2011"))
+    guide = Guide(board, lens.size, matrix=lens.matrix)
+    for pose in target_poses("charuco_poses", rig("casey2011"), 87):
+        seen = Seen("", np.arange(len(points)), lens.project(points @ pose.rotation.T + pose.translation))
+        assert all(moved(seen, earlier) > 2 * NEW_SHARE * lens.size[0] for earlier in guide.poses)
+        guide = guide.with_pose(seen)
+    assert len(guide.poses) == GOOD_POSES
+    assert guide.lacking() == ""
 
 
 def test_a_lit_target_is_seen_where_it_stands(lit: np.ndarray) -> None:
