@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
+from scanner.devices.receive_buffers import enlarging
+
 ROOM_BYTES = 5_000_000_000
 """A scan of 30 frames of 2 MP with its results is 0.25 GB: room for twenty"""
 
@@ -115,9 +117,7 @@ def receive_buffers(machine: Machine) -> Finding:
     found = _text(machine.proc / "sys/net/core/rmem_max")
     said = f"net.core.rmem_max is {found or 'not told'}; GigE cameras of 5 MP want {RECEIVE_BYTES}"
     if found.isdigit() and int(found) < RECEIVE_BYTES:
-        line = f"net.core.rmem_max={RECEIVE_BYTES}"
-        mend = f"echo {line} | sudo tee /etc/sysctl.d/70-fringed.conf && sudo sysctl -w {line}"
-        return Finding("receive buffers", Level.NOTE, said, mend)
+        return Finding("receive buffers", Level.NOTE, f"{said}, others nothing", enlarging(RECEIVE_BYTES))
     return Finding("receive buffers", Level.OK, said)
 
 
@@ -129,7 +129,7 @@ def modules(machine: Machine) -> Iterator[Finding]:
             "uvcvideo stamps",
             Level.BAD,
             "UVC cameras stamp frames when the host got them, and claim the start of exposure",
-            "echo options uvcvideo hwtimestamps=1 | sudo tee /etc/modprobe.d/fringed.conf"
+            "echo options uvcvideo hwtimestamps=1 | sudo tee /etc/modprobe.d/fringed-uvcvideo.conf"
             " && sudo rmmod uvcvideo && sudo modprobe uvcvideo",
         )
     elif stamps:

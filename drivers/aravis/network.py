@@ -12,6 +12,8 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
+from scanner.devices.receive_buffers import enlarging
+
 FRAMES_BUFFERED = 4
 """Frames that the receive buffer must hold while this process does not run for a moment"""
 
@@ -72,9 +74,7 @@ def check_buffer(frame_bytes: int, frames: int = FRAMES_BUFFERED, limit: int | N
     wanted = buffer_bytes(frame_bytes, frames)
     found = limit if limit is not None else _number(RMEM_MAX) or 0
     text = f"net.core.rmem_max is {found}, {frames} frames of {frame_bytes} bytes need {wanted}"
-    line = f"net.core.rmem_max={wanted}"
-    command = f"echo {line} | sudo tee /etc/sysctl.d/70-fringed-gige.conf && sudo sysctl -w {line}"
-    return Finding("receive buffer", found >= wanted, text, "" if found >= wanted else command)
+    return Finding("receive buffer", found >= wanted, text, "" if found >= wanted else enlarging(wanted))
 
 
 def interface_to(address: str) -> str | None:

@@ -29,6 +29,7 @@ from drivers.simulated.gige_features import PIXEL_FORMATS
 from drivers.simulated.gige_pixels import packed, payload_bytes
 from scanner.clock import MonotonicClock
 from scanner.devices import Interval
+from scanner.devices.receive_buffers import enlarging
 from scanner.errors import ConfigError, DeviceLost
 
 SECOND_NS = 1_000_000_000
@@ -177,8 +178,10 @@ def test_a_small_receive_buffer_is_named_with_the_command_that_mends_it() -> Non
     frame = 1_447_680
     small = check_buffer(frame, limit=212_992)
     assert not small.ok
-    assert f"net.core.rmem_max={buffer_bytes(frame)}" in small.command
-    assert "sysctl -w" in small.command
+    assert small.command == enlarging(frame), "the same line as for any camera that needs no more"
+    assert "sysctl -w net.core.rmem_max=67108864" in small.command
+    assert "/70-fringed.conf" not in small.command, "the installation's"
+    assert f"net.core.rmem_max={buffer_bytes(10 * frame)}" in check_buffer(10 * frame, limit=212_992).command
     assert check_buffer(frame, limit=buffer_bytes(frame)).ok
     assert check_buffer(frame, limit=buffer_bytes(frame)).command == ""
 
