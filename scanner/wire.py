@@ -14,6 +14,7 @@ import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from scanner.errors import ProtocolError, ScannerError, from_data
+from scanner.wire_hints import request_hint, values_hint
 
 PROTOCOL = (1, 0)
 """Major and minor version: another major is refused, another minor is not."""
@@ -294,7 +295,7 @@ def decode_request(data: bytes, check: Callable[[str], None] | None = None) -> R
         raise Refused(
             f"not a JSON-RPC 2.0 request: {error}",
             reason="invalid_request",
-            hint='a map of "jsonrpc": "2.0", id (integer or string), method, and params (a map) where it has any',
+            hint=request_hint(data),
         ) from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise Refused(f"not MessagePack: {error}", reason="malformed") from error
@@ -363,7 +364,8 @@ def params_as(kind: type[_Params], request: Request) -> _Params:
     try:
         return msgspec.convert(request.params, kind)
     except msgspec.ValidationError as error:
-        raise Refused(f"{request.method}: {error}", reason="invalid_params") from error
+        hint = values_hint(kind, str(error))
+        raise Refused(f"{request.method}: {error}", reason="invalid_params", hint=hint) from error
 
 
 def error_body(error: ScannerError) -> ErrorBody:

@@ -148,7 +148,7 @@ class Control:
             raise Refused(
                 f"the client speaks protocol {list(given.protocol)}, this daemon {list(PROTOCOL)}",
                 reason="protocol_version",
-                hint="install the same version of fringed on both sides",
+                hint=f"protocol: {list(PROTOCOL)}; programs that are fringed's own are of the daemon's version",
             )
         self._clients[identity] = given.client
         self._clients.move_to_end(identity)

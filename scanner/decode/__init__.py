@@ -146,7 +146,7 @@ def require_decoder(method: str, name: str) -> None:
         others = ", ".join(f"{known} ({of})" for of, names in DECODERS.items() for known in names if known != "default")
         raise DecodeError(
             f"no decoder {name!r} for method {method!r}",
-            hint=f"leave --decoder out for the default; there are: default (any method), {others}",
+            hint=f"decoder: default (any method), {others}",
         )
 
 

@@ -127,6 +127,30 @@ def test_members_of_envelopes_that_are_not_known_are_ignored() -> None:
 
 
 @pytest.mark.parametrize(
+    ("kind", "params", "hint"),
+    [
+        (wire.ScanStart, {"job_id": "x", "exposure": "often"}, 'exposure: a number, "auto" or null'),
+        (wire.LiveStart, {"job_id": "x", "method": "pmp"}, 'method: "mcp"'),
+        (wire.LiveStart, {"job_id": "x", "retain": "all"}, 'retain: "none", "record" or "ring"'),
+        (wire.LiveStart, {"job_id": "x", "stride": "two"}, None),
+    ],
+)
+def test_values_that_a_parameter_takes_are_listed(kind: Any, params: dict[str, Any], hint: str | None) -> None:
+    with pytest.raises(Refused) as caught:
+        wire.params_as(kind, Request(id=1, method="live.start", params=params))
+    assert caught.value.hint == hint
+
+
+def test_a_request_in_json_text_is_told_so() -> None:
+    with pytest.raises(Refused) as caught:
+        wire.decode_request(b' {"jsonrpc": "2.0", "id": 1, "method": "status"}')
+    assert "this is JSON text" in str(caught.value.hint)
+    with pytest.raises(Refused) as caught:
+        wire.decode_request(b"\x01")
+    assert "JSON text" not in str(caught.value.hint)
+
+
+@pytest.mark.parametrize(
     ("params", "named"),
     [
         ({"job_id": "x", "exposure": "often"}, "exposure"),
