@@ -23,6 +23,10 @@ UNSTEADY = 2.0
 """Scatter between repetitions above twice the stated sigma is no longer that sigma's own uncertainty (half of the
 sigma at R = 2, JCGM 100:2008 table E.1, and the median over an image is far better known): something else moved."""
 
+CONTRADICTING = 5.0
+"""Scatter of one pixel above so many times its stated sigma is no noise either: of normal noise a pixel of two million
+has it at R = 2, and fewer with more repetitions."""
+
 
 class Repetitions:
     """The mean of the decodings given so far. It keeps sums, not the decodings: memory does not grow with R."""
@@ -76,8 +80,10 @@ class Repetitions:
         """The mean.
 
         A pixel has a value where more than half of the repetitions gave one, none of them a fringe or stripe away
-        from the others; its sigma is that of the weighted mean (of rounding: that of one). Peaks and stripes are those
-        of the first repetition.
+        from the others; its sigma is that of the weighted mean (of rounding: that of one), widened by the ratio of what
+        the repetitions scatter to what they state (Birge 1932, Phys. Rev. 40, 207) where that is no noise: of the
+        image, if it is above UNSTEADY, and of the pixel, if it is above CONTRADICTING. Peaks and stripes are those of
+        the first repetition.
 
         Raises:
             ValueError: nothing was added.
@@ -93,10 +99,13 @@ class Repetitions:
             torn |= sums.conflict
         keep = enough & ~torn
         reason = np.where(keep, np.uint8(Reason.VALUE), np.where(enough, np.uint8(Reason.UNWRAP_RISK), self._reason))
-        means = {axis: sums.mean(keep, quantised=self._quantised) for axis, sums in self._sums.items()}
+        found = {axis: sums.scatter(keep) for axis, sums in self._sums.items()}
+        means = {
+            axis: sums.mean(keep, quantised=self._quantised, unsteady=_unsteady(found[axis]))
+            for axis, sums in self._sums.items()
+        }
         rows, sigma_rows = means.get("rows", (None, None))
         columns, sigma_columns = means.get("columns", (None, None))
-        found = {axis: sums.scatter(keep) for axis, sums in self._sums.items()}
         return replace(
             self._first,
             rows=rows,
@@ -168,13 +177,22 @@ class _AxisSums:
         self.squares += apart * apart
         self.count += use
 
-    def mean(self, keep: NDArray[np.bool_], *, quantised: bool) -> tuple[Map, Map]:
-        """Weighted mean and its sigma, NaN where not kept."""
+    def mean(self, keep: NDArray[np.bool_], *, quantised: bool, unsteady: float = 1.0) -> tuple[Map, Map]:
+        """Weighted mean and its sigma, NaN where not kept; `unsteady`: what all sigmas are widened by at least."""
         here = keep & (self.weight > 0)
         values, sigmas = np.full_like(self.origin, np.nan), np.full_like(self.origin, np.nan)
         values[here] = self.origin[here] + self.weighted[here] / self.weight[here]
         sigmas[here] = np.sqrt((self.count[here] if quantised else np.float32(1)) / self.weight[here])
+        sigmas[here] *= np.maximum(self._widening(here), np.float32(unsteady))
         return values, sigmas
+
+    def _widening(self, here: NDArray[np.bool_]) -> Map:
+        """Each pixel's own scatter over its stated sigma, where it contradicts that; else 1."""
+        plain, n = self.plain[here], self.count[here].astype(np.float32)
+        variance = np.maximum(self.squares[here] - plain * plain / n, 0) / np.maximum(n - 1, 1)
+        ratio = variance * self.weight[here] / n
+        widened: Map = np.sqrt(np.where(ratio > np.float32(CONTRADICTING**2), ratio, np.float32(1)))
+        return widened
 
     def scatter(self, keep: NDArray[np.bool_]) -> Scatter | None:
         """Of the pixels that every repetition gave; None where there is none, or one repetition only."""
@@ -190,10 +208,14 @@ class _AxisSums:
         return Scatter(float(np.sqrt(np.median(variance) / of_median)), float(np.median(stated)))
 
 
+def _unsteady(scatter: Scatter | None) -> float:
+    return scatter.ratio if scatter is not None and UNSTEADY < scatter.ratio < float("inf") else 1.0
+
+
 def _warnings(found: Mapping[str, Scatter | None]) -> list[str]:
     return [
         f"{axis}: the repetitions scatter by {scatter.measured_px:.3f} px, {scatter.ratio:.1f} times what one of them "
-        "states: the scene moved or the light changed in between"
+        "states: the scene moved or the light changed in between; sigmas and uncertainty are widened by it"
         for axis, scatter in found.items()
         if scatter is not None and scatter.ratio > UNSTEADY
     ]

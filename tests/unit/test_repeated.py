@@ -70,6 +70,17 @@ def test_a_scene_that_moved_is_said():
     random = np.random.default_rng(3)
     mean = mean_of([decoding(random, offset=0.5 * n) for n in range(4)])
     assert "moved or the light changed" in mean.warnings[0]
+    # Four at 0, .5, 1 and 1.5: their standard deviation over the root of four is what the mean is good for.
+    assert np.median(mean.sigma_rows) == pytest.approx(np.hypot(np.std([0, 0.5, 1, 1.5], ddof=1), SIGMA) / 2, rel=0.15)
+    assert mean.sigma_rows.min() > 3 * SIGMA / 2
+
+
+def test_a_part_that_moved_has_sigmas_of_its_own():
+    random = np.random.default_rng(3)
+    mean = mean_of([decoding(random), decoding(random, period=3.0)])
+    assert mean.warnings == ()
+    assert mean.sigma_rows[:5] == pytest.approx(np.full((5, SHAPE[1]), 3 / 2), rel=0.35)
+    assert mean.sigma_rows[5:] == pytest.approx(np.full((SHAPE[0] - 5, SHAPE[1]), SIGMA / np.sqrt(2)), rel=1e-3)
 
 
 def test_a_pixel_that_was_once_on_another_fringe_is_undecided():
