@@ -21,6 +21,8 @@ def ipc_path(endpoint: str) -> str:
             "use ipc:// here, or forward the socket through ssh",
         )
     path = endpoint.removeprefix("ipc://")
+    if not path.isprintable():
+        raise Refused(f"endpoint {endpoint!r:.120} has characters that no socket's name should have", reason="endpoint")
     if not path.startswith("/") or len(path.encode()) > 100:  # sockaddr_un holds 107, siblings add a few
         raise Refused(f"endpoint {endpoint!r} needs an absolute path of at most 100 bytes", reason="endpoint")
     return path

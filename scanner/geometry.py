@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.bounded_files import read_small_text
 from scanner.covariance import read_covariance
 from scanner.credible import check_response, lens_warnings, rig_warnings
 from scanner.errors import CalibrationError
@@ -164,7 +165,7 @@ def load_calibration(path: Path) -> Calibration:
         CalibrationError: unreadable, of another format or version, or not a geometry (NaN, singular, mirrored).
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(read_small_text(path))
     except OSError as error:
         raise CalibrationError(f"cannot read calibration {path}: {error.strerror}", hint=_MAKE) from error
     except (ValueError, RecursionError) as error:

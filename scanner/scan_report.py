@@ -15,6 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.bounded_files import read_small_text
 from scanner.capture import Capture
 from scanner.capture.exposure import exposure_report
 from scanner.decode import Decoded, Reason
@@ -103,7 +104,7 @@ def read_report(path: Path) -> dict[str, Any]:
         StorageError: unreadable, or of another format or version.
     """
     try:
-        report = json.loads(path.read_text(encoding="utf-8"))
+        report = json.loads(read_small_text(path))
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:

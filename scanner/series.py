@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from scanner.bounded_files import read_small_text
 from scanner.errors import DecodeError
 
 FORMAT = "fringed-series"
@@ -61,7 +62,7 @@ def recording_at(path: Path) -> list[SeriesFolder] | None:
         return read_series(path)
     file = path / HEADER_FILE if path.is_dir() else path
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(read_small_text(file))
         return [SeriesFolder(file.parent, int(content["live"]["first"]))]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None  # whatever is wrong with it, the reader of captures says it better
@@ -75,7 +76,7 @@ def read_series(folder: Path) -> list[SeriesFolder]:
     """
     path = folder / SERIES_FILE
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(read_small_text(path))
         if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("version") != VERSION:
             raise DecodeError(f"{path} is no version {VERSION} of {FORMAT}", hint="update fringed")
         found = [SeriesFolder(folder / str(c["folder"]), int(c["first"])) for c in content["captures"]]

@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from drivers.registry import Kind, check_driver
+from scanner.bounded_files import read_small_text
 from scanner.errors import ConfigError
 from service.rig_model import SAID, CameraConfig, ProjectorConfig, RigConfig, RigSettings, Table
 from service.toml_errors import syntax_problems
@@ -302,12 +303,12 @@ def _cut(text: str) -> str:
 
 def _read(path: Path) -> str:
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise ConfigError(f"{path} is larger than a rig file can be", hint="is it another file?")
-        return path.read_text(encoding="utf-8-sig")  # some editors write a byte order mark: it is no text
+        return read_small_text(
+            path, MAX_FILE_BYTES, encoding="utf-8-sig"
+        )  # some editors write a byte order mark: it is no text
     except FileNotFoundError as error:
         raise ConfigError(f"there is no rig file {path}", hint="--rig simulated needs no file") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not text in UTF-8, so it is no rig file", hint="save it as UTF-8") from error
     except OSError as error:
-        raise ConfigError(f"cannot read {_cut(str(path))}: {error.strerror}") from error
+        raise ConfigError(f"cannot read {_cut(str(path))}: {error.strerror}", hint="is it another file?") from error

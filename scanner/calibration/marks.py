@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.bounded_files import read_small_text
 from scanner.calibration.discs import disc_centres
 from scanner.calibration.verification import local_point, plane_of
 from scanner.errors import CalibrationError, DecodeError
@@ -179,7 +180,7 @@ def load_marks(path: Path) -> Marks:
         CalibrationError: it is not there, or no such file.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(read_small_text(path))
     except OSError as error:
         raise CalibrationError(f"cannot read marks {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.bounded_files import read_small_text
 from scanner.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -116,7 +117,7 @@ def load_discs(path: Path) -> Target:
         ConfigError: unreadable, or not such a file.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(read_small_text(path))
     except OSError as error:
         raise ConfigError(f"cannot read target {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:

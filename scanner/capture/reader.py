@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.bounded_files import read_small, read_small_text
 from scanner.capture.header import (
     FRAMES_FILE,
     HEADER_FILE,
@@ -24,6 +25,7 @@ from scanner.devices import Pixels
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat
 
+_WHAT_TO_GIVE = "give a capture folder, its capture.json, or the folder of a scan"
 SCAN_FOLDER = "capture"
 """Where a scan's folder has its capture"""
 
@@ -62,12 +64,9 @@ class Capture:
         """
         file = _header_at(path)
         try:
-            content = json.loads(file.read_text(encoding="utf-8"))
+            content = json.loads(read_small_text(file))
         except OSError as error:
-            raise DecodeError(
-                f"cannot read {file}: {error.strerror}",
-                hint="give a capture folder, its capture.json, or the folder of a scan",
-            ) from error
+            raise DecodeError(f"cannot read {file}: {error.strerror}", hint=_WHAT_TO_GIVE) from error
         except (ValueError, RecursionError) as error:
             raise DecodeError(f"{file} is not JSON: {error}") from error
         header = CaptureHeader.from_dict(content, str(file))
@@ -113,7 +112,7 @@ class Capture:
         slot = self._records[pattern].slot
         if self.header.frames is not None:
             name = self.header.frames[pattern]
-            image = _read_image(_inside(self.path, name))
+            image = _read_image(_inside(self.path, name), self.header.camera)
             self._require_alike(name, colour=image.ndim == 3)
             return _grey(image, self.header.camera, str(self.path / name))
         if slot is None or self._slots is None:
@@ -170,7 +169,7 @@ def _header_at(path: Path) -> Path:
 
 def _read_records(path: Path) -> list[FrameRecord] | None:
     try:
-        content = path.read_bytes()
+        content = read_small(path)
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -187,6 +186,8 @@ def _read_records(path: Path) -> list[FrameRecord] | None:
 
 def _map_frames(folder: Path, header: CaptureHeader) -> NDArray[Any] | None:
     path, camera = folder / FRAMES_FILE, header.camera
+    if path.exists() and not path.is_file():
+        raise DecodeError(f"{path} is no regular file", hint="a link to one will do; a pipe or device cannot be mapped")
     if not path.exists():
         if header.state != "complete":
             return None
@@ -234,15 +235,21 @@ def _read_npy_header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
     return shape, dtype, offset
 
 
+_PIXEL_BYTES = 32
+"""The most that an image file takes for a pixel: plain text PPM has three numbers of five digits, and has comments"""
+
+_IMAGE_HEAD_BYTES = 4 << 20
+"""... and before and after the pixels: colour profile, thumbnail, what a camera says of itself"""
+
 _BITS = "camera.bits in capture.json: up to 8 for uint8, 9 to 16 for uint16"
 
 
-def _read_image(path: Path) -> NDArray[Any]:
+def _read_image(path: Path, camera: CameraFormat) -> NDArray[Any]:
     """The pixels of a file: (height, width), or (height, width, 3) where it is in colour."""
     if not path.is_file():
         raise DecodeError(f"frame {path} is missing", hint="copy it there, or correct frames in capture.json")
     try:
-        content = path.read_bytes()
+        content = read_small(path, _IMAGE_HEAD_BYTES + _PIXEL_BYTES * camera.width * camera.height)
     except OSError as error:
         raise DecodeError(f"frame {path} cannot be read: {error.strerror}") from error
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None

@@ -184,10 +184,10 @@ def test_an_image_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pyt
     names = write_images(tmp_path / "c", [frame(0)] * 3)
     capture = Capture.open(image_capture(tmp_path / "c", names))
 
-    def refuse(_: Path) -> bytes:
+    def refuse(*_: object) -> bytes:
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_bytes", refuse)
+    monkeypatch.setattr("scanner.capture.reader.read_small", refuse)
     with pytest.raises(DecodeError, match=r"1\.png cannot be read: Permission denied"):
         capture.frame(1)
 

@@ -209,7 +209,9 @@ def test_other_answers_are_read_in_place_as_ever() -> None:
         Session.answer_in_place(memoryview(b"\xc1"))
 
 
-@pytest.mark.parametrize("endpoint", ["tcp://127.0.0.1:5555", "ipc://relative", "ipc:///" + 120 * "x", "inproc://a"])
+@pytest.mark.parametrize(
+    "endpoint", ["tcp://127.0.0.1:5555", "ipc://relative", "ipc:///" + 120 * "x", "inproc://a", "ipc:///a\0b"]
+)
 def test_endpoints_that_are_not_served(endpoint: str) -> None:
     with pytest.raises(Refused):
         ipc_path(endpoint)
