@@ -7,6 +7,7 @@ against its header before a byte of it is decoded.
 from __future__ import annotations
 
 import io
+import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -22,6 +23,12 @@ from scanner.storage import Written
 MAX_BYTES = 4 << 30
 """Of one array: a scan of a 100-megapixel camera stays below it."""
 
+
+ALIGNED_BYTES = 64
+"""Arrays begin at multiples of it in the file, as they do in a .npy: a reader may map them where they lie."""
+
+_ALIGNMENT_FIELD = 0xD935
+"""Of a member's extra field: its first two bytes are the alignment, the others fill up (Android's zipalign has it)"""
 
 MEMBER_BYTES = 512
 """Around each array at most: two headers of the archive and one of the array."""
@@ -68,6 +75,7 @@ class NpzWriter:
         info.header_offset = file.tell()
         info.file_size = info.compress_size = len(header) + len(content)
         info.CRC = 0 if now else zlib.crc32(content, zlib.crc32(header))
+        info.extra = _filling(info.header_offset + len(info.FileHeader()) + len(header))
         head = bytearray(info.FileHeader() + header)
         if now:
             self._unsummed.append((info, head, content))
@@ -76,6 +84,15 @@ class NpzWriter:
         file.write(content)
         self._members.append(info)
         return first
+
+
+def _filling(first: int) -> bytes:
+    """An extra field that moves what would begin at byte `first` to the next multiple of ALIGNED_BYTES."""
+    length = -first % ALIGNED_BYTES
+    if not length:
+        return b""
+    length += ALIGNED_BYTES if length < 6 else 0  # the field's own head
+    return struct.pack("<HHH", _ALIGNMENT_FIELD, length - 4, ALIGNED_BYTES).ljust(length, b"\0")
 
 
 def write_npz(file: BinaryIO, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -171,6 +171,7 @@ def test_points_come_first_and_nothing_of_a_scan_that_is_given_up_stays(scan, tm
         content = temporary_of(tmp_path / "scan.npz").read_bytes()
         for place in places:
             values = np.frombuffer(content, place.dtype, int(np.prod(place.shape)), place.offset)
+            assert place.offset % 64 == 0
             np.testing.assert_array_equal(values.reshape(place.shape), getattr(scan, place.name))
         writer.write(scan)
     with Digests() as digests:
