@@ -166,11 +166,13 @@ def report(
 
 
 def _warnings(solution: Solution, content: dict[str, Any]) -> list[str]:
+    if content["scale"] != "unverified":
+        return list(solution.warnings)
     unverified = (
-        "scale unverified: no length was stated, so that all lengths are as right as the target's stated size",
-        "measure its longest row of points: --length MM:SIGMA",
+        "scale unverified: no length was stated, and all lengths are only as right as the target's stated size; "
+        "measure its longest row of points (--length MM:SIGMA)"
     )
-    return [*solution.warnings, *([": ".join(unverified)] if content["scale"] == "unverified" else [])]
+    return [*solution.warnings, unverified]
 
 
 def _length_in_translation(solution: Solution, content: dict[str, Any]) -> dict[str, float] | None:
@@ -227,7 +229,7 @@ def _facts(
     told = ", ".join(_stated(v, e) for v, e in zip(shift, s, strict=True))
     facts.append(("translation", f"{told} mm{relative}"))
     if content["covariance"] is not None:
-        facts.append(("+-", "expanded uncertainty, k = 2, of each of these figures and of the scale's length"))
+        facts.append(("+-", "expanded uncertainty, k = 2, of each of these figures"))
     residuals = content["residuals"]
     for name, of in (
         ("camera", "distances of points seen from points predicted"),
