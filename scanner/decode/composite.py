@@ -22,6 +22,7 @@ from scipy.special import ndtr
 
 from scanner.decode import Decoded, Reason
 from scanner.decode.frames import FrameCheck
+from scanner.decode.mosaic import grey as one_channel
 from scanner.decode.noise import default_noise
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, CompositePattern, PatternSequence, ProjectorSize
@@ -44,6 +45,11 @@ LOWEST_CYCLES = 6.0
 
 HIGHEST = 0.4
 """Of the highest carrier, cycles per camera pixel: beyond, a camera's pixels leave next to nothing of it."""
+
+COARSE_PX = 6.0
+"""Least period of the finest carrier that leaves room for a scene's own detail below the lowest: the reference rig has
+7 px and keeps every scene's carriers; with 4 px a plain board's are found, and a textured bust's drown. Only words hang
+on it."""
 
 BAND_CONTRAST = 2.5
 """Least ratio of the weakest carrier's band to the median between bands, in power: noise and other patterns stay below
@@ -286,22 +292,11 @@ def envelopes(grey: Map, frequencies: NDArray[np.float64], sigma: float) -> Map:
 # --- refusals -----------------------------------------------------------------------------------------------------
 
 
-_MOSAICS = {
-    "RGGB": cv2.COLOR_BayerRGGB2GRAY,
-    "BGGR": cv2.COLOR_BayerBGGR2GRAY,
-    "GRBG": cv2.COLOR_BayerGRBG2GRAY,
-    "GBRG": cv2.COLOR_BayerGBRG2GRAY,
-}
-
-
 def _upright(image: NDArray[Any], pattern: CompositePattern, camera: CameraFormat) -> Map:
     """The image with its carriers along x, (H, W) float32."""
     if image.shape != camera.shape or image.dtype != camera.dtype:
         raise DecodeError(f"the image has shape {image.shape} and dtype {image.dtype}, not the camera's format")
-    if camera.mosaic is not None:
-        if camera.mosaic not in _MOSAICS:
-            raise DecodeError(f"unknown mosaic {camera.mosaic!r}", hint=f"known: {', '.join(sorted(_MOSAICS))}")
-        image = cv2.cvtColor(image, _MOSAICS[camera.mosaic])
+    image = one_channel(image, camera)
     if min(image.shape) < SMALLEST_PX:
         raise DecodeError(f"an image of {image.shape[1]} x {image.shape[0]} holds too few periods of the carriers")
     turned = image if pattern.axis == "y" else image.T
@@ -334,10 +329,15 @@ def _refuse_carriers(search: Carriers, grey: Map, pattern: CompositePattern) -> 
             hint='the other "axis" in the description, or turn projector or camera',
         )
     wanted = " : ".join(f"{f:g}" for f in pattern.carriers)
-    raise DecodeError(
-        f"no carriers stand out in the proportions {wanted} (contrast {search.contrast:.1f})",
-        hint="check carriers and axis of the description, focus, and what is projected",
-    )
+    said = f"no carriers stand out in the proportions {wanted} (contrast {search.contrast:.1f})"
+    finest = grey.shape[1] / max(pattern.carriers)
+    if finest < COARSE_PX:
+        raise DecodeError(
+            f"{said}; this camera is coarse for them: {finest:.1f} px for a period of the finest, where the pattern "
+            "fills its picture",
+            hint="take a camera of more pixels, or pmp or gray, which need fewer; a plain surface, in focus, may do",
+        )
+    raise DecodeError(said, hint="check carriers and axis of the description, focus, and what is projected")
 
 
 def _match(search: Carriers, pattern: CompositePattern) -> bool:

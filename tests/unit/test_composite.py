@@ -194,6 +194,7 @@ def test_what_is_not_the_pattern_described_is_refused():
     cases = {
         "uniform": (np.zeros_like(image), SMALL),
         "no carriers stand out": (np.random.default_rng(0).integers(0, 255, image.shape).astype(np.uint8), SMALL),
+        "coarse for them: 4.0 px": (np.random.default_rng(0).integers(0, 255, (240, 320)).astype(np.uint8), SMALL),
         "in the proportions": (image, CompositePattern(carriers=(20.0, 52.0, 71.0, 97.0))),
         "turned by 90 degrees": (np.ascontiguousarray(seen(SMALL, SIZE).T), SMALL),
     }

@@ -14,13 +14,14 @@ from scanner.crossings import Crossings, crossings_of, turned_over
 from scanner.decode import Decoded
 from scanner.decode.frames import FrameCheck
 from scanner.decode.mcp.decision import Decision, decide
-from scanner.decode.mcp.door import grey, turned, turned_back, upright_image, upside_down
+from scanner.decode.mcp.door import turned, turned_back, upright_image, upside_down
 from scanner.decode.mcp.locate import Array, Found, Image, Known, Stages, locate
 from scanner.decode.mcp.maps import fill_rows, maps_of
 from scanner.decode.mcp.model import PatternModel
 from scanner.decode.mcp.ranks import median
 from scanner.decode.mcp.resolution import if_whole, refuse_too_fine
 from scanner.decode.mcp.white import RATIO_BITS, divided, in_grey_levels
+from scanner.decode.mosaic import grey
 from scanner.errors import DecodeError
 from scanner.geometry import Calibration
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize

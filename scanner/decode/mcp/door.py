@@ -10,21 +10,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded
 from scanner.decode.mcp.locate import Image
+from scanner.decode.mosaic import grey
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, McpPattern
-
-_MOSAICS = {
-    "RGGB": cv2.COLOR_BayerRGGB2GRAY,
-    "BGGR": cv2.COLOR_BayerBGGR2GRAY,
-    "GRBG": cv2.COLOR_BayerGRBG2GRAY,
-    "GBRG": cv2.COLOR_BayerGBRG2GRAY,
-}
 
 
 def upright_image(image: NDArray[Any], pattern: McpPattern, camera: CameraFormat) -> Image:
@@ -39,19 +32,6 @@ def upright_image(image: NDArray[Any], pattern: McpPattern, camera: CameraFormat
 def turned(array: NDArray[Any]) -> NDArray[Any]:
     """(H, W) to (W, H), contiguous."""
     return np.ascontiguousarray(array.T)
-
-
-def grey(image: NDArray[Any], camera: CameraFormat) -> Image:
-    """One channel of light: a colour camera's mosaic is interpolated.
-
-    Raises:
-        DecodeError: a mosaic that is not known.
-    """
-    if camera.mosaic is None:
-        return image
-    if camera.mosaic not in _MOSAICS:
-        raise DecodeError(f"unknown mosaic {camera.mosaic!r}", hint=f"known: {', '.join(sorted(_MOSAICS))}")
-    return np.asarray(cv2.cvtColor(image, _MOSAICS[camera.mosaic]))
 
 
 def upside_down(decoded: Decoded) -> Decoded:
