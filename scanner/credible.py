@@ -34,6 +34,8 @@ ODD_SHIFT = 1.5
 """Sizes of the picture by which the principal point may lie off its middle and still be a projector's shift"""
 MOST_STRETCH, ODD_STRETCH = 10.0, 2.5
 """Focal length down over across, or the other way: mirrors set on edge make 2."""
+PIXEL_SHAPES, ODD_PIXEL = (0.5, 1.0, 2.0), 1.15
+"""A sensor's pixels are square, or joined in pairs; those of analogue cameras were up to 12 % longer than wide"""
 MOST_DISTORTION = 2.5
 """Factor by which distortion may move the middle of an edge: a lens of 120 degrees moves it by half its radius"""
 MOST_PX = 1 << 16
@@ -78,6 +80,17 @@ def lens_warnings(lens: Lens, name: str) -> list[str]:
     return said + _shift_warnings(lens, name) + _fold_warnings(lens, name)
 
 
+def pixel_warnings(camera: Lens, name: str) -> list[str]:
+    """What is odd about the shape of a camera's pixels; a projector's picture may be stretched by any factor."""
+    ratio = float(camera.matrix[1, 1] / camera.matrix[0, 0])
+    if min(max(ratio / shape, shape / ratio) for shape in PIXEL_SHAPES) <= ODD_PIXEL or ratio > ODD_STRETCH:
+        return []
+    return [
+        f"{name}.matrix: focal lengths of {camera.matrix[0, 0]:g} px across and {camera.matrix[1, 1]:g} px down mean "
+        "pixels that are not square, as nearly all cameras' are: was one of them changed, or the picture stretched?"
+    ]
+
+
 def rig_warnings(rig: Calibration, name: str) -> list[str]:
     """What is odd about where camera and projector stand.
 
@@ -101,6 +114,31 @@ def rig_warnings(rig: Calibration, name: str) -> list[str]:
     odd = metres if baseline < ODD_BASELINE_MM else micrometres if baseline > ODD_MOST_BASELINE_MM else None
     said = [] if odd is None else [f"{apart}, their common view begins at {depths.min():.3g} mm: {odd}"]
     return said + _parting_warnings(rig, name) + _epipole_warnings(rig, name)
+
+
+def check_hall(side: NDArray[np.float64], where: str) -> None:
+    """Raise CalibrationError where a 3 x 4 matrix projects no world: scaled otherwise than m34 = 1, or singular."""
+    if abs(side[2, 3] - 1) > 1e-6:
+        raise CalibrationError(
+            f"{where}: its last number, m34, must be 1, got {side[2, 3]:g}",
+            hint="divide all twelve by it; leave hall out, or null, where it is not known",
+        )
+    # Rows of pixels and of the scale differ by powers of ten.
+    rows = side[:, :3] / np.maximum(np.linalg.norm(side[:, :3], axis=1, keepdims=True), 1e-300)
+    if abs(np.linalg.det(rows)) < 1e-9:
+        raise CalibrationError(
+            f"{where} is singular: a whole direction of space would be seen at one pixel",
+            hint="leave hall out, or null, where it is not known",
+        )
+
+
+def check_slope(slope: float, where: str) -> None:
+    """Raise CalibrationError where MCP's stripes would all be one row, or run backwards."""
+    if slope <= 0:
+        raise CalibrationError(
+            f"{where} must be above 0, projector px from stripe to stripe, got {slope:g}",
+            hint="leave mcp_phase out, or null, where it was not fitted",
+        )
 
 
 def check_response(response: Mapping[str, Any], name: str) -> None:

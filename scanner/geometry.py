@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from scanner.bounded_files import read_small_text
 from scanner.covariance import read_covariance
-from scanner.credible import check_response, lens_warnings, rig_warnings
+from scanner.credible import check_hall, check_response, check_slope, lens_warnings, pixel_warnings, rig_warnings
 from scanner.errors import CalibrationError
 from scanner.kernel import kernel
 
@@ -197,6 +197,7 @@ def calibration_from_dict(content: Any, name: str = "calibration") -> Calibratio
     _check_optional(content, name)
     camera, projector = (_lens(content.get(side), f"{name}: {side}") for side in ("camera", "projector"))
     odd = [*lens_warnings(camera, f"{name}: camera"), *lens_warnings(projector, f"{name}: projector")]
+    odd += pixel_warnings(camera, f"{name}: camera")
     rotation = _matrix(content.get("rotation"), (3, 3), f"{name}: rotation")
     translation = _matrix(content.get("translation"), (3,), f"{name}: translation")
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
@@ -326,13 +327,16 @@ def _check_optional(content: Mapping[str, Any], name: str) -> None:
         if not isinstance(member, dict):
             raise CalibrationError(f"{name}: {key} must be null or an object, got {member!r:.80}")
         for part, shape in members.items():
-            _matrix(member.get(part), shape, f"{name}: {key}.{part}")
+            numbers = _matrix(member.get(part), shape, f"{name}: {key}.{part}")
+            if key == "hall":
+                check_hall(numbers, f"{name}: hall.{part}")
     phase = content.get("mcp_phase")
     if phase is not None:
         if not isinstance(phase, dict):
             raise CalibrationError(f"{name}: mcp_phase must be null or an object, got {phase!r:.80}")
         for part in ("slope", "intercept"):
             _matrix(phase.get(part), (), f"{name}: mcp_phase.{part}")
+        check_slope(float(phase["slope"]), f"{name}: mcp_phase.slope")
     response = content.get("response")
     if response is not None and not (
         isinstance(response, dict) and all(side is None or isinstance(side, dict) for side in response.values())

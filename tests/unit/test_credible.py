@@ -51,6 +51,13 @@ def shifted(c: Content, shift: float = 1.1) -> None:
     c["rotation"], c["translation"] = np.eye(3).tolist(), [0.0, 160.0, 0.0]
 
 
+def hall(content: Content, m34: float, left: Any = None) -> None:
+    """The rig's own lens, 500 mm from the world's origin, as Hall's matrix has it."""
+    lens = np.array(content["camera"]["matrix"]) / 500 if left is None else left
+    matrix = np.column_stack((lens, [160.0, 120.0, m34])).tolist()
+    content["hall"] = {"camera": matrix, "projector": matrix}
+
+
 REFUSED = [
     (lambda c: scaled(c, 1e-3), r"0\.2 mm apart: nothing can be", "in metres, multiply the translation by 1000"),
     (lambda c: scaled(c, 1e4), "2e.06 mm apart", "micrometres"),
@@ -71,6 +78,10 @@ REFUSED = [
     (lambda c: c.update(response={"projector": {"gamma": float("nan")}}), r"response\.projector\.gamma", ""),
     (lambda c: c.update(response={"projector": {"gamma": 1e308}}), r"response\.projector\.gamma", ""),
     (lambda c: c.update(response={"camera": {"table": [1.0, 0.0] * 128}}), r"response\.camera\.table", ""),
+    (lambda c: hall(c, 0.0), r"hall\.camera: .* m34, must be 1, got 0", "divide"),
+    (lambda c: hall(c, 2.0), r"hall\.camera: .* m34, must be 1, got 2", "divide"),
+    (lambda c: hall(c, 1.0, np.zeros((3, 3))), r"hall\.camera is singular", "null"),
+    (lambda c: c.update(mcp_phase={"slope": 0, "intercept": 3.0}), r"mcp_phase\.slope must be above 0", "null"),
     (lambda c: c.update(residuals=5), "residuals must be", ""),
     (lambda c: c.update(residuals={"epipolar_px": "small"}), "epipolar_px", ""),
 ]  # fmt: skip
@@ -95,6 +106,8 @@ ODD = [
     (lambda c: c.update(rotation=np.eye(3).tolist(), translation=[0, 0, -200]), "in the camera's picture"),
     (lambda c: focal(c, "camera", 1e6, 1e6), r"angle of view of 0\.0183 degrees across"),
     (lambda c: focal(c, "projector", 700, 2100), "3 times"),
+    (lambda c: focal(c, "camera", 1.2 * 620.0, 620.0), "pixels that are not square"),
+    (lambda c: focal(c, "camera", 620.0, 0.7 * 620.0), "pixels that are not square"),
     (lambda c: shifted(c, 3.5), "outside the picture"),
     (lambda c: c["camera"].update(distortion=[-1.76, 0, 0, 0, 0]), "in its corners"),
 ]  # fmt: skip
@@ -118,6 +131,10 @@ def test_what_is_odd_is_believed_with_a_warning(
         lambda c: scaled(c, 2 * ODD_BASELINE_MM / 200),
         lambda c: c.update(rotation=np.eye(3).tolist()),  # side by side, parallel
         lambda c: focal(c, "projector", 700, 1400),  # mirrors on edge
+        lambda c: focal(c, "camera", 620, 310),  # pixels joined in pairs
+        lambda c: focal(c, "camera", 620, 1.1 * 620),  # analogue
+        lambda c: hall(c, 1.0),
+        lambda c: c.update(mcp_phase={"slope": 4.0, "intercept": -2.0}),
         shifted,
     ],
 )
