@@ -343,7 +343,7 @@ def _name_peaks(
 YARDSTICK = (
     "the published decoder (Casey 2011), a yardstick: nothing is taken out that is not taken out there, so that "
     "stripes with a wrong name stay, centimetres to decimetres off; its confidence is the posterior of its hidden "
-    "Markov model, which does not know them (leave --decoder out for one that does)"
+    "Markov model, which does not know them; that of the default decoder does"
 )
 
 
