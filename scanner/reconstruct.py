@@ -315,7 +315,7 @@ class Reconstruction:
         return replace(decoded, details=details, warnings=(*decoded.warnings, *said))
 
     def _catch_up(self, capture: Capture) -> None:
-        present = {pattern: record.slot for pattern, record in capture.records.items()}
+        present = {pattern: record.slot for pattern, record in capture.require_any().items()}
         stale = any(slot is not None and present.get(pattern) != slot for pattern, slot in self._slots.items())
         if stale or self._slots.keys() - present.keys():
             self._begin()

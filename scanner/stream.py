@@ -23,6 +23,7 @@ EndReason = Literal[
     "overrun",
     "worker_lost",
     "disk_full",
+    "storage_failed",
     "daemon_restarted",
 ]
 """Why a series ended."""

@@ -128,7 +128,7 @@ class Scan:
     def _ended_with(self, outcome: Acquisition) -> Callable[[StorageError | None], None]:
         def say(problem: StorageError | None) -> None:
             error = problem or self._with_timing(outcome.error)
-            reason: EndReason = "disk_full" if problem is not None else outcome.reason.value
+            reason: EndReason = outcome.reason.value if problem is None else reason_of(problem) or "disk_full"
             body = None if error is None else error_body(error)
             self._say(Ended(self.job, reason, self._lines, list(outcome.missing), body, outcome.report()))
 

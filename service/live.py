@@ -289,7 +289,7 @@ class LiveRun:
         try:
             await self._pipeline.on_disk(reserve, self._pipeline.spool, self._kept, list(self._pipeline.store))
         except StorageError as error:
-            self._fail(error, "disk_full")
+            self._fail(error, reason_to_fail(error))
 
     # --- the end -----------------------------------------------------------------------------------------------
 

@@ -96,7 +96,7 @@ class LiveRun(Scan):
         try:
             storage.close("complete" if failed is None else "failed", reason)
         except ScannerError as error:
-            failed, reason = failed or error, "disk_full" if failed is None else reason
+            failed, reason = failed or error, reason_of(error) or "disk_full" if failed is None else reason
         body = None if failed is None else error_body(failed)
         report = {"lost": self._lost, "kept": {"frames": self._kept.frames, "bytes": self._kept.bytes}}
         self._say(Ended(self.job, reason, self._lines, error=body, report=report))

@@ -23,6 +23,7 @@ REACH_PX = 15.0
 CLEAR_PX = 8.0
 """From the edge: the sides are what they are from here on."""
 FEWEST_LINES = 10
+NO_POINTS = "is it in view and in the light, and did filters leave its points? preview.png shows where points are"
 FEWEST_PIXELS = 300
 LEAST_STEP = 10.0
 """Height of the step over the noise beside it: the tenths of the height are then a sigma of one pixel each."""
@@ -56,7 +57,7 @@ def edge_width(xyz: NDArray[Any]) -> EdgeWidth:
     depth = np.asarray(xyz[..., 2], dtype=np.float64)
     y, x = np.nonzero(np.isfinite(depth))
     if len(x) < FEWEST_PIXELS:
-        raise DecodeError(f"{len(x)} points are too few for an edge, {FEWEST_PIXELS} are needed")
+        raise DecodeError(f"{len(x)} points are too few for an edge, {FEWEST_PIXELS} are needed", hint=NO_POINTS)
     z = depth[y, x]
     terms: Array = np.column_stack((np.ones(len(x)), x, y)).astype(np.float64)
     near, far, side, noise = _two_planes(terms, z)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.calibration.detection import Detection, NotFound, detect
+from scanner.calibration.edges import NO_POINTS
 from scanner.calibration.features import (
     Array,
     belonging,
@@ -313,7 +314,9 @@ def _finite(xyz: NDArray[Any]) -> tuple[Array, NDArray[np.intp]]:
     at = np.flatnonzero(np.isfinite(flat).all(axis=1))
     points: Array = flat[at].astype(np.float64)
     if len(points) < FEWEST_POINTS:
-        raise DecodeError(f"{len(points)} points are too few to measure a feature by, {FEWEST_POINTS} are needed")
+        raise DecodeError(
+            f"{len(points)} points are too few to measure a feature by, {FEWEST_POINTS} are needed", hint=NO_POINTS
+        )
     return points, at
 
 

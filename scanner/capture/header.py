@@ -201,6 +201,9 @@ class CaptureHeader:
         frames = content.get("frames")
         if frames is not None and not (isinstance(frames, list) and all(isinstance(f, str) for f in frames)):
             raise DecodeError(f"{name}: frames must be a list of file names")
+        plan = content.get("plan")
+        if plan is not None and not (isinstance(plan, dict) and isinstance(plan.get("why") or {}, dict)):
+            raise DecodeError(f"{name}: plan must be null or an object, and why in it too, got {plan!r:.80}")
         state = content.get("state", "complete")
         if state not in ("open", "complete", "failed"):
             raise DecodeError(f"{name}: state must be open, complete or failed, got {state!r}")
@@ -218,7 +221,7 @@ class CaptureHeader:
             calibration=calibration,
             state=state,
             reason=content.get("reason"),
-            plan=content.get("plan"),
+            plan=plan,
             witnesses=tuple(witnesses),
             frames=None if frames is None else tuple(frames),
             extra={key: value for key, value in content.items() if key not in known},

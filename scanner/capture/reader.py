@@ -78,6 +78,31 @@ class Capture:
         """By pattern index: the last whole line of each pattern whose frame is here."""
         return self._records
 
+    def require_any(self) -> Mapping[int, FrameRecord]:
+        """`records`, of a capture that is to be decoded.
+
+        Raises:
+            DecodeError: there are none; which file is to blame, and why.
+        """
+        if not self._records:
+            raise DecodeError(f"no frame can be taken: {self._fault()}", hint=_NO_FRAME)
+        return self._records
+
+    def _fault(self) -> str:
+        lines, frames = self.path / RECORDS_FILE, self.path / FRAMES_FILE
+        if self._slots is None:
+            return f"{frames} holds none"
+        if not self.all_records:
+            return f"{lines} holds no whole line that is a frame's record"
+        last = self.all_records[-1]
+        if last.pattern >= self.header.frame_count:
+            return f"{lines} tells of pattern {last.pattern}, and the capture has {self.header.frame_count} from 0"
+        if last.status != "ok" or last.slot is None:
+            return f"{lines} says that the frame of pattern {last.pattern} is {last.status}"
+        if last.slot >= len(self._slots):
+            return f"{lines} names slot {last.slot}, and {FRAMES_FILE} has {len(self._slots)} from 0"
+        return f"the pixels of {frames}, slot {last.slot}, are not those that the digest in {RECORDS_FILE} was made of"
+
     @property
     def missing(self) -> tuple[int, ...]:
         """Pattern indices of a whole capture that are not here."""
@@ -222,7 +247,7 @@ def _read_npy_header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
             shape, fortran, dtype = read(file)
             offset = file.tell()
     except Exception as error:  # a header is Python text: NumPy's reader fails on bad ones in a dozen ways
-        raise DecodeError(f"{path} is not a NumPy array file: {error}") from error
+        raise DecodeError(f"{path} is not a NumPy array file: {error}", hint=_ARRAY) from error
     whole = all(type(n) is int and n >= 0 for n in shape)
     if (
         not whole
@@ -231,7 +256,9 @@ def _read_npy_header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
         or dtype not in (np.uint8, np.uint16)
         or shape[1] * shape[2] > MAX_PIXELS
     ):
-        raise DecodeError(f"{path}: expected uint8 or uint16 of shape (slots, height, width), found {dtype} {shape}")
+        raise DecodeError(
+            f"{path}: expected uint8 or uint16 of shape (slots, height, width), found {dtype} {shape}", hint=_ARRAY
+        )
     return shape, dtype, offset
 
 
@@ -241,6 +268,8 @@ _PIXEL_BYTES = 32
 _IMAGE_HEAD_BYTES = 4 << 20
 """... and before and after the pixels: colour profile, thumbnail, what a camera says of itself"""
 
+_ARRAY = "copy it again, or write it with numpy.save: (slots, height, width), uint8 or uint16, in C order"
+_NO_FRAME = "copy the folder again, or capture again; without frames.jsonl all slots are taken, in pattern order"
 _BITS = "camera.bits in capture.json: up to 8 for uint8, 9 to 16 for uint16"
 
 

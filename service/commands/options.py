@@ -5,7 +5,6 @@ They end as plain data, in the words of formats.md; numbers out of bounds and co
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -268,14 +267,18 @@ def _choice(text: str, name: str, choices: tuple[str, ...]) -> str:
     return text
 
 
+MOST_PERIODS = 65_535
+"""No projector has more pixels along an axis (rig-file.md)"""
+
+
 def numbers(text: str, name: str) -> list[float]:
     """A list of positive numbers, "1,8,64"; whole ones as integers."""
     try:
         values = [float(word) for word in text.split(",")]
     except ValueError as error:
         raise typer.BadParameter(f"{name}: expected numbers with commas between them, got {text!r}") from error
-    if any(not math.isfinite(value) or value <= 0 for value in values):
-        raise typer.BadParameter(f"{name}: expected positive numbers, got {text!r}")
+    if any(not 0 < value <= MOST_PERIODS for value in values):  # nor NaN
+        raise typer.BadParameter(f"{name}: expected positive numbers up to {MOST_PERIODS}, got {text!r:.80}")
     return [int(value) if value == int(value) else value for value in values]
 
 

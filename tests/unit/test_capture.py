@@ -26,6 +26,7 @@ from scanner.capture.exposure import exposure_report, exposure_warnings
 from scanner.devices import Exposure, Flip, Source
 from scanner.errors import DecodeError, StorageError
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
+from scanner.reconstruct import reconstruct
 
 PROJECTOR = ProjectorSize(64, 48)
 SEQUENCE = PatternSequence.bracketed(PROJECTOR, PmpPattern(frequencies=(1.0, 4.0), shifts=(3, 4)))
@@ -262,6 +263,8 @@ def test_a_calibration_elsewhere_is_refused_with_what_to_do(tmp_path: Path) -> N
         ({"version": True}, "version True"),
         ({"calibration": 5}, "calibration must be"),
         ({"witnesses": 5}, "witnesses must be"),
+        ({"plan": 5}, "plan must be"),
+        ({"plan": {"why": 5}}, "plan must be"),
         ({"frames": ["0.png", "1" * 5000, "2.png"]}, "is no file name"),
         ({"frames": ["0.png", "\0", "2.png"]}, "is no file name"),
         ({"camera": {"width": 20, "height": 10, "bits": 8, "mosaic": "purple"}}, "mosaic"),
@@ -351,6 +354,34 @@ def test_no_folder_and_no_json_are_named(tmp_path: Path) -> None:
     (tmp_path / "capture.json").write_text("{")
     with pytest.raises(DecodeError, match="not JSON"):
         Capture.open(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("lines", "says"),
+    [
+        (b"", "frames.jsonl holds no whole line that is a frame's record"),
+        (b"{not a record}\n", "frames.jsonl holds no whole line that is a frame's record"),
+        (
+            b'{"slot": 0, "pattern": 0, "xxh3": "0011223344556677"}\n',
+            "the pixels of .*frames.npy, slot 0, are not those",
+        ),
+        (b'{"slot": 900, "pattern": 0}\n', "frames.jsonl names slot 900, and frames.npy has"),
+        (b'{"slot": 0, "pattern": 900}\n', "frames.jsonl tells of pattern 900, and the capture has"),
+        (b'{"slot": null, "pattern": 3, "status": "missing"}\n', "says that the frame of pattern 3 is missing"),
+    ],
+)
+def test_a_capture_none_of_whose_frames_can_be_taken_says_which_file_is_to_blame(
+    lines: bytes, says: str, tmp_path: Path
+) -> None:
+    writer = CaptureWriter(tmp_path / "c", header(), len(SEQUENCE))
+    write_frames(writer, range(len(SEQUENCE)))
+    writer.close("complete")
+    assert len(Capture.open(tmp_path / "c").require_any()) == len(SEQUENCE)
+    (tmp_path / "c" / "frames.jsonl").write_bytes(lines)
+    with pytest.raises(DecodeError, match=says):
+        Capture.open(tmp_path / "c").require_any()
+    with pytest.raises(DecodeError, match=says):
+        reconstruct(Capture.open(tmp_path / "c"), None)
 
 
 def test_the_exposure_that_was_used_is_told_and_warned_of_where_it_is_another() -> None:

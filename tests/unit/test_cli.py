@@ -62,6 +62,7 @@ def test_version_and_bare_call(run: Run) -> None:
         (["scan", "--exposure", "-3"], "1 .. 10000000"),
         (["scan", "--frequencies", "1,x"], "--frequencies"),
         (["scan", "--frequencies", "1,0"], "positive"),
+        (["scan", "--frequencies", "1,1e308"], "--frequencies: expected positive numbers up to 65535"),
         (["scan", "--shifts", "4.5"], "whole numbers"),
         (["scan", "--frequencies", "1,8", "--shifts", "4,4,4"], "3 numbers for 2 frequencies"),
         (["scan", "--carriers", "5,6"], "says nothing to the method pmp"),

@@ -19,6 +19,7 @@ from scanner.storage import storage_errors
 from scanner.stream import PointsNote
 from scanner.wire import ArrayEntry, FileEntry, ScanStart
 from service.acquisition import Scan
+from service.endings import reason_to_fail
 from service.jobs import Job, JobState, JobStore
 from service.pipe import CancelAcquire, Ended, Need, Taken, framed, read_command
 from service.pipeline import Pipeline
@@ -210,6 +211,16 @@ def test_a_truth_that_cannot_be_written_ends_the_scan_alone(tmp_path: Path) -> N
     scan = Scan("job", tmp_path / "gone", params, opened, VirtualClock(), lambda _: None)
     with pytest.raises(StorageError):
         scan._write_truth()
+
+
+@pytest.mark.parametrize(
+    ("number", "reason"), [(errno.ENOSPC, "disk_full"), (errno.EDQUOT, "disk_full"), (errno.EPERM, "storage_failed")]
+)
+def test_a_disk_that_is_not_full_is_not_called_so(number: int, reason: str, tmp_path: Path) -> None:
+    with pytest.raises(StorageError) as raised, storage_errors(tmp_path):
+        raise OSError(number, "no")
+    assert reason_to_fail(raised.value) == reason
+    assert reason_to_fail(StorageError("the spool holds 2 MB of 2 MB")) == "disk_full"
 
 
 def test_files_that_cannot_be_deleted_are_not_called_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
