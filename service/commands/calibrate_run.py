@@ -89,7 +89,7 @@ def run(
     \b
     Examples:
       fringed calibrate run "simulated:charuco_poses?walk=true&seed=87" --target charuco:10x7:30 --auto -o scans/rig
-      fringed calibrate run bench.toml --target charuco:10x7:30 --length 240.1:0.05 -o bench-calibration
+      fringed calibrate run bench.toml --target charuco:10x7:30 --length 240.1:0.05 -o calibrations/bench
       fringed calibrate run bench.toml --target charuco:10x7:30 --auto --write
     """
     from scanner.calibration.solve import SolveOptions  # noqa: PLC0415
