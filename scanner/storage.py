@@ -48,10 +48,11 @@ def replacing(path: Path, digests: Digests | None = None, *, room: int = 0) -> I
         room: bytes that will be written at most; taken from the disk at once, which then writes them faster.
 
     Raises:
-        StorageError: the disk is full, or the folder cannot be written.
+        StorageError: the disk is full, the folder cannot be written, or a device or folder is there.
     """
     temporary = temporary_of(path)
     with storage_errors(path):
+        _require_replaceable(path)
         try:
             with temporary.open("wb", buffering=0) as raw:
                 if room:
@@ -78,13 +79,19 @@ def try_file(path: Path) -> None:
         StorageError: it will not.
     """
     with storage_errors(path):
-        if path.is_dir():
-            raise StorageError(f"{path} is a folder, a file is to be written", hint="give another name")
+        _require_replaceable(path)
         if not path.parent.is_dir():
             raise StorageError(f"{path} cannot be written: there is no folder {path.parent}", hint="make it first")
         temporary = temporary_of(path)
         temporary.touch()
         temporary.unlink()
+
+
+def _require_replaceable(path: Path) -> None:
+    # A rename would put a file in the place of /dev/null, for everybody on the machine.
+    if path.exists() and not path.is_file():
+        what = "a folder" if path.is_dir() else "a device, pipe or socket"
+        raise StorageError(f"{path} is {what}, a file is to be written", hint="give another name")
 
 
 def temporary_of(path: Path) -> Path:

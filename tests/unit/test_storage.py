@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import stat
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from scanner.errors import StorageError
-from scanner.storage import try_file, try_output
+from scanner.storage import replace_file, try_file, try_output
 from service import cli, private
 from service.commands.scan import INCOMING, Place
 
@@ -89,3 +92,13 @@ def test_an_unwritable_output_is_told_before_anything_is_opened(
     monkeypatch.setattr(private, "private_daemon", lambda _: pytest.fail("a daemon was started"))
     assert cli.main([*words, option, str(tmp_path / "none" / "x.png")]) == 1
     assert "there is no folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("begin", [lambda path: replace_file(path, b"{}"), try_file])
+def test_a_device_is_not_replaced(begin: Callable[[Path], None], tmp_path: Path) -> None:
+    """A rename does so, as root /dev/null's too."""
+    os.mkfifo(tmp_path / "null")
+    with pytest.raises(StorageError, match="null is a device"):
+        begin(tmp_path / "null")
+    assert stat.S_ISFIFO((tmp_path / "null").stat().st_mode)
+    assert [path.name for path in tmp_path.iterdir()] == ["null"]
