@@ -48,6 +48,13 @@ are: frequencies described 3 % wrong cost a tenth of the agreement."""
 SCALES = np.exp(np.arange(-0.7, 0.701, 0.01))
 """From half to twice the size; those within .015 of 1 are no other"""
 
+SHIFTS = np.arange(-2.5, 2.51, 0.05)
+"""Bars by which all positions may be moved: what is farther off is told by `BARS_GAIN`"""
+
+LEAST_SHIFT, SHIFT_GAIN = 0.075, 0.04
+"""Bars, and how much more must agree then (a tenth of a bar costs .05). In sound captures no shift wins .005, and the
+best is .05 bars at most."""
+
 MIN_BARS_SEEN = 8
 """Different bars in view, fewer than which could agree by chance (2^-8)."""
 
@@ -240,7 +247,7 @@ def _bars(
         cannot.append(f"{blind} (no order bars)")
         return []
     b = np.min([fit.modulation[use] for fit in fits], axis=0)
-    fraction, sigma = _trusted(scene, fits, ladder, cycles, np.abs(vectors), centre, b)
+    fraction, sigma, rung = _trusted(scene, fits, ladder, cycles, np.abs(vectors), centre, b)
     bar = (fraction - (pattern.origin - 0.5) / scene.sequence.projector.along(axis)) * BAR_COUNT
     known = sigma * BAR_COUNT < 0.5
     seen = np.unique(np.floor(bar[known & (bar > 0) & (bar < BAR_COUNT)]).astype(int))
@@ -258,20 +265,44 @@ def _bars(
             f"{other_at}: all sets are rotated or reversed alike"
         )
         return [Witness(name, False, here, other - BARS_GAIN, frames, says, whole=True)]
-    scaled, scale = _best_scale(bar[known], above > 0) if here + SCALE_GAIN <= 1 else (0.0, 1.0)
-    if scaled >= max(MIN_SCALED_AGREEMENT, here + SCALE_GAIN):
-        frames = tuple(sorted({position, *(p for fit in fits for p in fit.positions)}))
-        says = (
-            f"{here:.0%} of pixels agree with the order bars along {axis} where the fringes put them, {scaled:.0%} if "
-            f"positions are {scale:.2f} times as large: the description's frequencies or projector size are not those "
-            "of the frames"
-        )
-        return [Witness(name, False, here, scaled - SCALE_GAIN, frames, says, whole=True)]
+    everything = tuple(sorted({position, *(p for fit in fits for p in fit.positions)}))
+    along = scene.sequence.projector.along(axis)
+    if elsewhere := _elsewhere(pattern, axis, along, bar[known], above > 0, here, rung):
+        agrees, says = elsewhere
+        return [Witness(name, False, here, agrees - SCALE_GAIN, everything, says, whole=True)]
     binary = float(np.mean(np.abs(above) > 0.5 * b[known]))
     if here < MIN_BARS_AGREEMENT and binary < MIN_BARS_AGREEMENT:
         says = "the frame of the order bars shows no bars"
         return [Witness(name, False, here, MIN_BARS_AGREEMENT, (position,), says)]
     return [Witness(name, True, here, MIN_BARS_AGREEMENT, says=f"{here:.0%} agree with the fringes, no place more")]
+
+
+def _elsewhere(
+    pattern: PmpPattern,
+    axis: Axis,
+    along: int,
+    bar: NDArray[np.float64],
+    light: NDArray[np.bool_],
+    here: float,
+    finest: float,
+) -> tuple[float, str] | None:
+    """(agreement, in words) where all positions together are moved, or of another size, by the bars; None: neither."""
+    moved, shift = _best_shift(bar, light, max(LEAST_SHIFT, 2 * NEARBY / finest))
+    scaled, scale = _best_scale(bar, light) if shift or here + SCALE_GAIN <= 1 else (0.0, 1.0)
+    if shift and moved >= scaled:
+        return moved, (
+            f"{moved:.0%} of pixels agree with the order bars along {axis} if all positions are moved by "
+            f"{shift * along / BAR_COUNT:+.0f} px: the description's origin ({pattern.origin:g}) or offset "
+            f"({pattern.offset:g}) is not that of the frames"
+        )
+    scaled, scale = _best_scale(bar, light) if here + SCALE_GAIN <= 1 else (0.0, 1.0)
+    if scaled < max(MIN_SCALED_AGREEMENT, here + SCALE_GAIN):
+        return None
+    return scaled, (
+        f"{here:.0%} of pixels agree with the order bars along {axis} where the fringes put them, {scaled:.0%} if "
+        f"positions are {scale:.2f} times as large: the description's frequencies or projector size are not those "
+        "of the frames"
+    )
 
 
 def _nearby(fits: Sequence[Fit], ladder: Ladder) -> float:
@@ -292,8 +323,8 @@ def _trusted(
     lengths: NDArray[np.float64],
     centre: float,
     b: Array,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Field fractions (P,) from the highest rung that is surely unwrapped, and their 1-sigma."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Field fractions (P,) from the highest rung that is surely unwrapped, their 1-sigma, and that rung's frequency."""
     variances = np.array([2 / fit.fringe_set.shifts for fit in fits])
     rung = 0
     while rung < len(lengths) and lengths[rung] > 0.8:
@@ -301,7 +332,7 @@ def _trusted(
     part = Ladder(ladder.combinations[: rung + 1], ladder.frequencies[: rung + 1], ladder.errors[:rung], False)
     fraction, _ = climb(part, cycles, centre)
     weight = float(np.sqrt(np.sum(ladder.combinations[rung] ** 2 * variances))) / (2 * np.pi)
-    return fraction, scene.noise / b * weight / ladder.frequencies[rung]
+    return fraction, scene.noise / b * weight / ladder.frequencies[rung], float(ladder.frequencies[rung])
 
 
 def _best_places(bar: NDArray[np.float64], light: NDArray[np.bool_], nearby: float) -> tuple[float, float, str]:
@@ -330,6 +361,28 @@ def _best_places(bar: NDArray[np.float64], light: NDArray[np.bool_], nearby: flo
                 far = agrees
                 far_at = f"{'mirrored and ' if mirrored else ''}{away / BAR_COUNT:.0%} of the field away"
     return near, far, far_at
+
+
+def _best_shift(bar: NDArray[np.float64], light: NDArray[np.bool_], least: float) -> tuple[float, float]:
+    """(agreement, bars) of the least shift that agrees best; 0 bars where it is below `least` or little is won by it.
+
+    The response bends positions, but does not move them all; what it bends is less, the finer the fringes.
+    """
+    stride = max(1, bar.size // 1500)
+    bar, light = bar[::stride], light[::stride]
+    lit = bar_light(np.arange(BAR_COUNT), BAR_COUNT) > 0.5
+
+    def agreement(shift: float) -> float:
+        place = np.floor(bar + shift).astype(np.intp)
+        inside = (place >= 0) & (place < BAR_COUNT)
+        return float(np.mean(inside & (lit[np.clip(place, 0, BAR_COUNT - 1)] == light)))
+
+    unmoved = agreement(0.0)
+    if unmoved + SHIFT_GAIN > 1:
+        return unmoved, 0.0
+    best, shift = max((agreement(float(shift)), float(shift)) for shift in SHIFTS)
+    believed = abs(shift) > least and best >= max(MIN_SCALED_AGREEMENT, unmoved + SHIFT_GAIN)
+    return (best, shift) if believed else (unmoved, 0.0)
 
 
 def _best_scale(bar: NDArray[np.float64], light: NDArray[np.bool_]) -> tuple[float, float]:

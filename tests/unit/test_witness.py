@@ -322,6 +322,17 @@ def test_frequencies_that_were_not_projected_are_told_by_the_bars(pattern: str, 
     assert "frequencies or projector size" in wrong.says
 
 
+@pytest.mark.parametrize("move", [-12.0, 1.5, 6.0])
+def test_an_origin_that_is_not_that_of_the_frames_is_told_by_the_bars(move: float) -> None:
+    capture = taken("4 shifts")
+    content = {**capture.sequence.describe(), "origin": 0.5 + move}
+    described = PatternSequence.from_description(capture.sequence.projector, content)
+    found = witness(described, capture.thumbnails, capture.format.max_value)
+    (said,) = [item.says for item in found.items if not item.passed]
+    (told,) = re.findall(r"order bars along y if .* moved by ([+-]\d+) px: the description's origin", said)
+    assert float(told) == pytest.approx(move, abs=2)
+
+
 def test_a_frame_of_bars_that_shows_none_is_named() -> None:
     capture = gray_taken("board")
     bars = capture.sequence.bars["y"]
