@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from scanner.covariance import LENS_MEMBERS, read_covariance
+from scanner.covariance import LENS_MEMBERS, Covariance, read_covariance
 from scanner.geometry import Array, Calibration, Lens
 from scanner.scan import Scan
 
@@ -69,10 +69,7 @@ def point_spread(calibration: Calibration, pixels: Array, xyz: Array, axis: str)
         pixels: (n, 2) px of the camera. xyz: (n, 3) mm, the points seen there. axis: whose coordinates told their
             depth.
     """
-    try:
-        read = read_covariance(calibration.extra.get("covariance"))
-    except ValueError:  # said when the file was read
-        return None
+    read = _covariance_of(calibration)
     if read is None:
         return None
     depth = xyz[:, 2]
@@ -101,10 +98,7 @@ def across_spread(calibration: Calibration, pixels: Array, depth: Array, axis: s
     Returns:
         (n,); None where the calibration has no covariance that can be used.
     """
-    try:
-        read = read_covariance(calibration.extra.get("covariance"))
-    except ValueError:  # said when the file was read
-        return None
+    read = _covariance_of(calibration)
     if read is None:
         return None
     other = "x" if axis == "y" else "y"
@@ -123,6 +117,13 @@ def across_spread(calibration: Calibration, pixels: Array, depth: Array, axis: s
             moves[:, k] = (across - slant * along) / (2 * sigma)
     variance = np.einsum("ni,ij,nj->n", moves, read.matrix, moves)
     return np.asarray(np.sqrt(np.clip(variance, 0, None)), dtype=np.float64)
+
+
+def _covariance_of(calibration: Calibration) -> Covariance | None:
+    try:
+        return read_covariance(calibration.extra.get("covariance"))
+    except ValueError:  # said when the file was read
+        return None
 
 
 def _rays(rig: Calibration, pixels: Array) -> Array:
