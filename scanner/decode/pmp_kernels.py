@@ -22,6 +22,7 @@ from scanner.kernel import contracting_kernel, inlined_kernel
 from scanner.lanes import (
     LANES,
     Lanes,
+    align_stack,
     all_of,
     any_of,
     choose,
@@ -117,6 +118,7 @@ def decode_pixels(
             empty, and are left out then. reason: (P,) uint8, written.
         counts: (REASONS,) int64, how many pixels have each reason, is added to.
     """
+    align_stack()
     sets, steps = gains.size, ratios.size
     # Behind phases and B^2 by set: what the ladder combines of sets, a beat for each rung, a spread for each step.
     spot = aligned_rows(2 * sets + 2 * steps + 1, LANES).reshape(-1)

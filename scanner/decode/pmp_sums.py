@@ -18,6 +18,7 @@ from scanner.kernel import contracting_kernel, inlined_kernel
 from scanner.lanes import (
     LANES,
     Lanes,
+    align_stack,
     choose,
     expect,
     floats,
@@ -89,6 +90,7 @@ def fit_runs(
         mean, residual: (R x length,) float32, written: A, mean of the sets; squared residuals, sum of the sets.
         clipped: (R x length,) bool, written.
     """
+    align_stack()
     sets = starts.size - 1
     turns = turns_of(starts, weights, whole)
     spot = aligned_rows(2 * sets + 3, LANES).reshape(-1)
