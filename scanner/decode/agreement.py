@@ -12,18 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
-from math import atan2, hypot, pi
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from scanner.decode.noise import NoiseModel, default_noise, fit_noise
-from scanner.decode.sample_kernels import judge_steps
+from scanner.decode.sample_kernels import MIN_PIXELS
 from scanner.decode.unwrapping import Ladder
-
-MIN_PIXELS = 400
-"""Fewer usable pixels than this say nothing."""
 
 MIN_AGREEMENT = 0.3
 """Mean cosine of remainders: chance gives 0, noise of a fifth of a fringe .45."""
@@ -35,7 +31,6 @@ MOST_SYSTEMATIC = 0.1
 """Of a fringe, sigma over the image, by which neighbouring rungs may differ beyond noise before it is said: half a
 fringe, from which on the next one is counted, is then five sigmas away, and such errors have longer tails than noise"""
 
-_NOISE_BINS = 8
 _UNFOLDED_SIGMA = 0.15
 """Predicted sigma of a pair's difference, cycles, up to which it stays within half a cycle (3.3 sigma)."""
 _ROUNDS = 3
@@ -69,27 +64,16 @@ class Remainder:
         return float(np.sqrt(max(spread2 - self.expected_sigma**2, 0.0)))
 
 
-def agreement(
-    ladder: Ladder, phases: NDArray[np.float32], cycles2: NDArray[np.float32], centre: float, floor_cycles: float
-) -> list[Remainder]:
-    """How well neighbouring rungs agree, over a sample of usable pixels.
+def remainders(ladder: Ladder, found: NDArray[np.float64], pixels: int) -> list[Remainder]:
+    """How well neighbouring rungs agree, from what `judge_steps` found over a sample of usable pixels.
 
     Args:
-        phases: (K, n) cycles. cycles2: (K, n) expected variance of each. centre: the field's centre, fraction of it.
-        floor_cycles: least systematic sigma of a set's phase.
+        found: (J - 1, 4). pixels: of the sample.
     """
-    steps = list(pairwise(ladder.frequencies.tolist()))
-    if phases.shape[1] < MIN_PIXELS:
-        return [Remainder(low, high, 0.0, floor_cycles, 0.0, 0.0, phases.shape[1]) for low, high in steps]
-    errors2 = np.asarray(ladder.errors**2, np.float32)
-    evidence = judge_steps(
-        phases, cycles2, ladder.combinations.astype(np.float64), ladder.frequencies, errors2, centre, _NOISE_BINS
-    )
+    steps = zip(pairwise(ladder.frequencies.tolist()), found.tolist(), strict=True)
     return [
-        _remainder(
-            low, high, x.tolist(), y.tolist(), means.tolist(), float(weights.sum()), floor_cycles, phases.shape[1]
-        )
-        for (low, high), x, y, means, weights in zip(steps, *evidence, errors2, strict=True)
+        Remainder(low, high, expected, systematic, offset, agreement, pixels)
+        for (low, high), (expected, systematic, offset, agreement) in steps
     ]
 
 
@@ -168,41 +152,9 @@ def noise_of_pairs(
     return model
 
 
-def _remainder(
-    low: float,
-    high: float,
-    x: list[float],
-    medians: list[float],
-    means: list[float],
-    weight: float,
-    least: float,
-    pixels: int,
-) -> Remainder:
-    """x, medians, means: of `judge_steps`, one step's."""
-    y = [_sigma_of_median(median) ** 2 for median in medians]
-    # Weights 1 / y: a variance's own error grows with it.
-    weights = [1 / max(of_bin, 1e-12) for of_bin in y]
-    rest = sum(w * (seen - meant) for w, seen, meant in zip(weights, y, x, strict=True)) / sum(weights)
-    cosine, sine, variance = means
-    return Remainder(
-        low,
-        high,
-        variance**0.5,
-        max((max(rest, 0.0) / weight) ** 0.5, least),
-        atan2(sine, cosine) / (2 * pi),
-        hypot(cosine, sine),
-        pixels,
-    )
-
-
-def _sigma_of_median(median: float) -> float:
-    # Sigma of a normal error folded into +-1/2 whose absolute value has this median; an even spread has 1/4.
-    sigmas, medians = _folded_medians()
-    return median / 0.6745 if median < medians[0] else float(np.interp(median, medians, sigmas))
-
-
 @cache
-def _folded_medians() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def folded_medians() -> NDArray[np.float64]:
+    """(2, m) sigmas of normal errors folded into +-1/2, and the medians of their absolute values; not to be written."""
     sigmas = np.linspace(0.05, 0.5, 46)
     x = np.linspace(0, 0.5, 2001)
     folds = np.arange(-3, 4)[:, None]
@@ -210,4 +162,4 @@ def _folded_medians() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     for sigma in sigmas:
         inside = (ndtr((x + folds) / sigma) - ndtr((-x + folds) / sigma)).sum(axis=0)
         medians.append(float(np.interp(0.5, inside, x)))
-    return sigmas, np.maximum.accumulate(np.array(medians))
+    return np.stack([sigmas, np.maximum.accumulate(np.array(medians))])

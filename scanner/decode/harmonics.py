@@ -9,40 +9,25 @@ Nothing here corrects a pixel.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.pmp_frames import AxisFrames
+from scanner.decode.pmp_frames import AxisFits
 from scanner.decode.ripples import RippleFit
 from scanner.decode.spectra import (
-    AA,
-    AB,
-    BB,
-    IMAGINARY,
+    LEAST_PIXELS,
     MEANT_IMAGINARY,
     MEANT_REAL,
     ORDERS,
     POWER,
-    REAL,
     SEEN_IMAGINARY,
     SEEN_REAL,
     SUMS,
-    sum_spectra,
 )
-
-MOST_SHARE = 0.45
-"""Of an overtone in its fringe: gamma 3 gives .4. And each order is lower than the one before, from LEAST_SHARE on."""
-
-LEAST_SHARE = 0.02
-
-LEAST_PIXELS = 128
-"""Fewer say nothing of a whole scan's overtones."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +52,72 @@ class SetHarmonics:
 
 
 @dataclass(frozen=True)
+class HeightWeights:
+    """What takes samples to the heights of their orders, by sets.
+
+    weights: (K, ORDERS, 2, N) float32 of the samples, to the real and imaginary part of each order's height, 0 where a
+    set has fewer. kinds: (K, 3) intp: shifts; orders that they show, 0 of a set that lost frames; the order N / 2,
+    whose height is real, or 0.
+    """
+
+    weights: NDArray[np.float32]
+    kinds: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, fits: AxisFits) -> HeightWeights:
+        """Of sets that are whole; their order N / 2 is turned so that its height is real: a cosine and a sine of it
+        cannot be told apart."""
+        return _height_weights(tuple(tuple(alpha.tolist()) for alpha in fits.angles))
+
+
+@lru_cache(maxsize=32)
+def _height_weights(angles: tuple[tuple[float, ...], ...]) -> HeightWeights:
+    # Every scan of a rig asks for the same, and nobody writes into it.
+    weights = np.zeros((len(angles), ORDERS, 2, max(map(len, angles))), np.float32)
+    kinds = np.zeros((len(angles), 3), np.intp)
+    for k, of_set in enumerate(angles):
+        shifts, alpha = len(of_set), np.array(of_set)
+        orders = min(ORDERS, shifts // 2)
+        folded = shifts // 2 if shifts % 2 == 0 and 2 <= shifts // 2 <= ORDERS else 0
+        turns = np.arange(1, orders + 1)[:, None] * alpha
+        weights[k, :orders, :, :shifts] = np.stack([np.cos(turns), -np.sin(turns)], axis=1) * (2 / max(shifts, 1))
+        if folded:
+            weights[k, folded - 1, 0, :shifts] = np.cos(folded * (alpha - alpha[0])) / shifts
+            weights[k, folded - 1, 1] = 0
+        kinds[k] = shifts, orders, folded
+    return HeightWeights(weights, kinds)
+
+
+@dataclass(frozen=True)
+class SpectraSums:
+    """What `sum_sets` writes for K sets."""
+
+    sums: NDArray[np.float64]
+    levels: NDArray[np.float64]
+    ratios: NDArray[np.complex128]
+
+    @classmethod
+    def empty(cls, sets: int) -> SpectraSums:
+        """To be written."""
+        return cls(np.zeros((sets, ORDERS + 1, SUMS)), np.zeros(sets), np.zeros((sets, ORDERS), np.complex128))
+
+    def spectra(self, heights: HeightWeights, count: int) -> tuple[SetSpectrum | None, ...]:
+        """By set, of `count` pixels; None of one that lost frames, and where too few pixels were asked."""
+        if count < LEAST_PIXELS:
+            return (None,) * len(self.sums)
+        kinds = heights.kinds.tolist()
+        return tuple(
+            self._spectrum(k, shifts, orders, folded, count) if orders else None
+            for k, (shifts, orders, folded) in enumerate(kinds)
+        )
+
+    def _spectrum(self, k: int, shifts: int, orders: int, folded: int, count: int) -> SetSpectrum:
+        rows, ratios = self.sums[k].tolist(), self.ratios[k].tolist()
+        left = tuple(_left(rows[m], ratios[m - 1], m == folded) / count for m in range(2, orders + 1))
+        return SetSpectrum(shifts, tuple(ratios[1:orders]), left, rows[1][POWER] / count, float(self.levels[k]) / count)
+
+
+@dataclass(frozen=True)
 class SetSpectrum:
     """One set over the pixels that were asked.
 
@@ -81,100 +132,6 @@ class SetSpectrum:
     power: float
     level: float
 
-    @property
-    def of_response(self) -> bool:
-        """Whether a response could have made them; frames that changed places and scenes that move make others."""
-        shares = [abs(ratio) for ratio in self.ratios]
-        rising = any(high > max(low, LEAST_SHARE) for low, high in pairwise(shares))
-        return bool(shares) and max(shares) < MOST_SHARE and not rising
-
-    @property
-    def energy(self) -> float:
-        """What a response's overtones add to a pixel's squared residual on the average, grey levels squared."""
-        if not self.of_response:
-            return 0.0
-        # Of order N / 2 half is seen, and weighs twice.
-        return self.power * self.shifts / 2 * sum(abs(ratio) ** 2 for ratio in self.ratios)
-
-
-def spectra_of(
-    frames: AxisFrames,
-    runs: NDArray[np.intp],
-    every: int,
-    good: NDArray[np.bool_],
-    level: NDArray[np.float32],
-) -> tuple[SetSpectrum | None, ...]:
-    """Of each set; None of one that lost frames, and where too few pixels are good.
-
-    Args:
-        runs: (R,) first pixels, of which one in `every` is asked. good: (R, L) pixels with light, not clipped.
-        level: (R, L) mean grey level.
-    """
-    count = int(np.count_nonzero(good[::every]))
-    found: list[SetSpectrum | None] = []
-    like = frames.like
-    for k, alpha in enumerate(frames.angles):
-        if count < LEAST_PIXELS or not len(alpha):
-            found.append(None)
-            continue
-        first, shifts = int(frames.starts[k]), len(alpha)
-        sums = np.zeros((ORDERS + 1, SUMS))
-        weights = height_weights(alpha)
-        total = sum_spectra(
-            frames.addresses[first : first + shifts], like, weights, _folded(shifts),
-            runs, good.shape[1], every, good, level, sums,
-        )  # fmt: skip
-        # A few numbers: without arrays.
-        rows, orders = sums.tolist(), range(2, len(weights) + 1)
-        ratios = tuple(_ratio(rows[m], 2 * m == shifts) for m in orders)
-        left = tuple(_left(rows[m], ratio, 2 * m == shifts) / count for m, ratio in zip(orders, ratios, strict=True))
-        found.append(SetSpectrum(shifts, ratios, left, rows[1][POWER] / count, total / count))
-    return tuple(found)
-
-
-def height_weights(alpha: NDArray[np.float64]) -> NDArray[np.float32]:
-    """(M, 2, N) of a set's samples, to the real and imaginary parts of each order's height.
-
-    The order N / 2 is turned so that its height is real: a cosine and a sine of it cannot be told apart.
-    """
-    return _height_weights(tuple(alpha.tolist()))
-
-
-@lru_cache(maxsize=64)
-def _height_weights(angles: tuple[float, ...]) -> NDArray[np.float32]:
-    # Every scan of a rig asks for the same.
-    alpha, shifts = np.array(angles), len(angles)
-    turns = np.arange(1, min(ORDERS, shifts // 2) + 1)[:, None] * alpha
-    weights = np.stack([np.cos(turns), -np.sin(turns)], axis=1) * (2 / shifts)
-    if folded := _folded(shifts):
-        weights[folded - 1] = np.stack([np.cos(folded * (alpha - alpha[0])), np.zeros(shifts)]) / shifts
-    return weights.astype(np.float32)
-
-
-def explained_by(
-    spectra: Sequence[SetSpectrum | None], frames: AxisFrames, pixels: NDArray[np.intp]
-) -> NDArray[np.float32]:
-    """(n,) float32: what overtones are of the squared residuals at `pixels`, grey levels squared."""
-    explained = np.zeros(pixels.size, np.float32)
-    for k, (spectrum, alpha) in enumerate(zip(spectra, frames.angles, strict=True)):
-        if spectrum is None or not spectrum.of_response:
-            continue
-        first, shifts = int(frames.starts[k]), len(alpha)
-        samples = np.stack([frames.frames[first + n].reshape(-1)[pixels] for n in range(shifts)]).astype(np.float32)
-        weights = height_weights(alpha)
-        parts = (weights.reshape(-1, shifts) @ samples).reshape(len(weights), 2, -1)
-        heights = parts[:, 0] + np.complex64(1j) * parts[:, 1]
-        meant = heights[0]
-        turn = meant / np.maximum(np.abs(meant), np.float32(1e-12))
-        for order, ratio in enumerate(spectrum.ratios, start=2):
-            meant = meant * turn
-            there = meant * np.complex64(ratio)
-            weight = np.float32(shifts / 2)
-            if 2 * order == shifts:
-                there, weight = there.real, np.float32(shifts)
-            explained += weight * (2 * (np.conj(there) * heights[order - 1]).real - np.abs(there) ** 2)
-    return explained
-
 
 def told_of(frequency: float, shifts: int, spectrum: SetSpectrum | None, variance: float, count: int) -> SetHarmonics:
     """What a spectrum says, for people. variance: of one sample; count: pixels asked."""
@@ -184,22 +141,6 @@ def told_of(frequency: float, shifts: int, spectrum: SetSpectrum | None, varianc
     shares: list[float | None] = [float(abs(ratio)) for ratio in spectrum.ratios]
     second, third, fourth = (*shares, None, None, None)[:3]
     return SetHarmonics(frequency, shifts, second, third, fourth, sigma)
-
-
-def _folded(shifts: int) -> int:
-    return shifts // 2 if shifts % 2 == 0 and 2 <= shifts // 2 <= ORDERS else 0
-
-
-def _ratio(sums: list[float], folded: bool) -> complex:
-    """The ratio that explains most of an order's height."""
-    if not folded:
-        return complex(sums[REAL], sums[IMAGINARY]) / max(sums[POWER], 1e-12)
-    aa, ab, bb = sums[AA], sums[AB], sums[BB]
-    determinant = aa * bb - ab * ab
-    if determinant < 1e-9 * aa * bb:
-        return 0j
-    real, imaginary = bb * sums[REAL] - ab * sums[IMAGINARY], aa * sums[IMAGINARY] - ab * sums[REAL]
-    return complex(real / determinant, imaginary / determinant)
 
 
 def _left(sums: list[float], ratio: complex, folded: bool) -> complex:

@@ -7,13 +7,12 @@ nothing. This file does not know where the residuals come from.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from operator import mul
-from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode.middles import middles_of_bins
+from scanner.kernel import kernel
 
 ROUNDING_VARIANCE = 1 / 12
 """Variance of rounding to whole grey levels; no frame is better."""
@@ -23,6 +22,9 @@ DEFAULT_FULL_WELL_E = 10_000
 
 DEFAULT_READ_SHARE = 0.004
 """Its read noise as a share of the range (1 grey level of 8 bits)."""
+
+FEWEST = 100
+"""Samples without which nothing is said of a camera's noise."""
 
 _LEVELS = 12
 
@@ -56,33 +58,29 @@ def fit_noise(level: NDArray[np.float32], squares: NDArray[np.float32], freedom:
     Medians in bins of equal count stand against pixels that moved or are mixed; the median of a chi-square variable of
     k degrees is k (1 - 2 / (9 k))^3 (Wilson and Hilferty 1931). Under 100 samples, or no freedom, give the default.
     """
-    if freedom < 1 or level.size < 100:
+    if freedom < 1 or level.size < FEWEST:
         return default_noise(max_value)
+    return NoiseModel(*fit_line(level, squares, freedom), measured=True)
+
+
+@kernel
+def fit_line(level: NDArray[np.float32], squares: NDArray[np.float32], freedom: int) -> tuple[float, float]:
+    """Variance at level 0, and per level, of FEWEST or more samples: see `fit_noise`."""
     # As many in each bin: up to eleven of the brightest are left out.
-    levels, medians, _ = middles_of_bins(level, squares, _LEVELS, True)
-    # A dozen numbers: without arrays.
-    per_freedom = freedom * (1 - 2 / (9 * freedom)) ** 3
-    x, y = levels.tolist(), [of_bin / per_freedom for of_bin in medians.tolist()]
+    x, medians, _ = middles_of_bins(level, squares, _LEVELS, True)
+    y = medians / (freedom * (1 - 2 / (9 * freedom)) ** 3)
     # A variance's own error grows with it: weights 1 / y, one round of which is enough for two parameters.
-    w = [1 / max(of_bin, ROUNDING_VARIANCE) for of_bin in y]
-    slope, read = _line(x, y, [one * one for one in w]) if max(x) - min(x) > 1 else (0.0, median(y))
+    w = 1 / np.maximum(y, ROUNDING_VARIANCE)
+    slope, read = 0.0, float(np.median(y))
+    if x.max() - x.min() > 1:
+        total = (w * w).sum()
+        x0, y0 = (w * w * x).sum() / total, (w * w * y).sum() / total
+        there = w * w * (x - x0)
+        slope = (there * (y - y0)).sum() / (there * (x - x0)).sum()
+        read = y0 - slope * x0
     if slope < 0:
-        slope, read = 0.0, _dot(w, y) / sum(w)
+        slope, read = 0.0, (w * y).sum() / w.sum()
     elif read < ROUNDING_VARIANCE:
         read = ROUNDING_VARIANCE
-        there = [a * a * b for a, b in zip(w, x, strict=True)]
-        slope = max(_dot(there, [of_bin - read for of_bin in y]) / max(_dot(there, x), 1e-12), 0.0)
-    return NoiseModel(max(read, ROUNDING_VARIANCE), slope, measured=True)
-
-
-def _line(x: list[float], y: list[float], weights: list[float]) -> tuple[float, float]:
-    """Slope and value at 0 of the line with the least weighted squares."""
-    total = sum(weights)
-    x0, y0 = _dot(weights, x) / total, _dot(weights, y) / total
-    there = [w * (at - x0) for w, at in zip(weights, x, strict=True)]
-    slope = _dot(there, [of_bin - y0 for of_bin in y]) / _dot(there, [at - x0 for at in x])
-    return slope, y0 - slope * x0
-
-
-def _dot(a: list[float], b: list[float]) -> float:
-    return float(sum(map(mul, a, b)))
+        slope = max((w * w * x * (y - read)).sum() / max((w * w * x * x).sum(), 1e-12), 0.0)
+    return max(read, ROUNDING_VARIANCE), slope

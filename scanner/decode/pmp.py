@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode import Coordinates, Decoded, Reason, neighbours, one_surface
+from scanner.decode import Coordinates, Decoded, Reason, neighbours, one_surface, spectra
 from scanner.decode.agreement import disagreements, doubtful_counts
 from scanner.decode.doubled import doubled_frames
 from scanner.decode.frames import FrameCheck
 from scanner.decode.lone_set import require_fringes
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps
 from scanner.decode.pmp_frames import axis_frames
+from scanner.decode.pmp_plan import plan_axis, whole_sets
 from scanner.decode.strips import threads_to_use
-from scanner.decode.unwrapping import plan_ladder
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
 from scanner.patterns.description import Axis
@@ -58,7 +58,8 @@ class PmpDecoder:
         self._camera = camera
         self._thresholds = thresholds or PmpThresholds()
         self._threads = threads or threads_to_use()
-        plan_ladder(self._pattern.frequencies, [2 / n for n in self._pattern.shifts])
+        for axis in self._pattern.axes:
+            plan_axis(self._pattern, sequence.projector.along(axis), whole_sets(self._pattern))
         self._check = FrameCheck(sequence, camera)
         self._fringe_at = {position: fringe for fringe, position in enumerate(sequence.fringes)}
         self._frames: dict[int, NDArray[Any]] = {}
@@ -242,3 +243,4 @@ def warm_up() -> None:
         decoder.finish()
     neighbours.warm_up()
     one_surface.warm_up()
+    spectra.warm_up()

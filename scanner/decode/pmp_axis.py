@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Map, Reason
 from scanner.decode.addresses import maps_to_fill
-from scanner.decode.agreement import MIN_PIXELS, Remainder
+from scanner.decode.agreement import Remainder, remainders
 from scanner.decode.cut_at_black import unmove_dark
 from scanner.decode.doubled import may_be_doubled
 from scanner.decode.neighbours import settle
@@ -25,12 +24,14 @@ from scanner.decode.one_surface import doubt_axis, doubtful_steps
 from scanner.decode.pmp_frames import AxisFrames
 from scanner.decode.pmp_join import join_maps
 from scanner.decode.pmp_kernels import decode_pixels
-from scanner.decode.pmp_light import Light, judge_light, judge_ripple
+from scanner.decode.pmp_light import Light, honest, judge_light, judge_ripple
+from scanner.decode.pmp_plan import plan_axis
 from scanner.decode.pmp_sample import take_sample
 from scanner.decode.reasons import REASONS
+from scanner.decode.sample_kernels import MIN_PIXELS
 from scanner.decode.strips import in_strips
 from scanner.decode.torn_rows import LEAST_LIT, LEAST_SHARE, PARTS, leave_torn_rows_out
-from scanner.decode.unwrapping import Ladder, plan_ladder
+from scanner.decode.unwrapping import Ladder
 from scanner.patterns import CameraFormat
 from scanner.patterns.description import Axis
 from scanner.patterns.pmp import PmpPattern
@@ -193,39 +194,24 @@ def decode_axis(
         along: projector pixels along the axis. threads: that share the pass. ladder: the way up to the finest set;
             None: as `plan_ladder` finds it.
     """
-    t = thresholds
-    pixels, finest = camera.width * camera.height, finest_of(pattern)
-    # The field's centre as a fraction of it, where the pattern's phase is counted from `origin` before pixel 0.
-    centre = 0.5 + (pattern.origin - 0.5) / along
-    ladder = ladder or plan_ladder(pattern.frequencies, frames.gains)
-    sample = take_sample(frames, pixels, camera.max_value, t.clip(camera), t.min_modulation_levels)
-    least = max(t.min_modulation_levels, t.min_modulation_share * sample.brightest(finest))
-    sample, light = judge_light(sample, frames, pattern.frequencies, along, least, t.min_modulation_sigmas, not brief)
-    noise = sample.noise(ladder, centre, least, t.min_modulation_sigmas)
-    judged = sample.judged(noise, least, t.min_modulation_sigmas)
-    remainders = judged.agreement(ladder, centre, t.phase_floor_cycles)
-    per_cycle = along / float(ladder.frequencies[-1])
-    random_px, ripple = np.nan, None
-    if not brief:
-        random_px = per_cycle * judged.phase_sigma(finest)
-        light = judge_ripple(
-            light, frames, sample, pixels, t.clip(camera), ladder, noise, centre, along, least, t.min_modulation_sigmas
-        )
-    if not brief and remainders and remainders[-1].pixels >= MIN_PIXELS:
-        ripple = _ripple(remainders[-1], float((ladder.errors[-1] ** 2).sum()), per_cycle, random_px)
-    f32 = partial(np.array, dtype=np.float32)
-    errors2 = ladder.errors**2
-    systematic = np.array([r.systematic for r in remainders], dtype=np.float64)
+    t, plan = thresholds, plan_axis(pattern, along, frames.there, ladder)
+    pixels, finest, clip, sigmas = camera.width * camera.height, plan.finest, t.clip(camera), t.min_modulation_sigmas
+    modulation_limits = t.min_modulation_levels, t.min_modulation_share, sigmas
+    sample, seen = take_sample(frames, plan, pixels, camera.max_value, clip, modulation_limits)
+    sample, least = honest(sample, seen, frames, plan), seen.least
+    judged = sample.judged(plan, least, sigmas, t.phase_floor_cycles)
+    noise = judged.noise
     arguments = (
-        frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, frames.whole, t.clip(camera),
-        f32(frames.gains), f32(ladder.combinations), f32(ladder.ratios),
-        f32(errors2), f32(errors2.sum(axis=1) * systematic**2),
-        f32([noise.read, noise.per_level, ROUNDING_VARIANCE, sample.prior, 1 / (sample.prior + frames.freedom)]),
-        f32([along, pattern.origin, ladder.frequencies[0] * centre, ladder.frequencies[-1], centre - 0.5]),
-        f32([least, t.min_modulation_sigmas**2, t.max_residual_sigmas**2,
-             t.max_residual_share**2 + sample.overtone_share2(finest), t.max_remainder_sigmas**2,
-             1 - t.min_unwrap_probability, t.edge_sigmas]),
-        ladder.periodic, finest,
+        frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, frames.whole, clip,
+        plan.gains, plan.rungs, plan.ratios, plan.errors2,
+        np.asarray(plan.step_errors2 * judged.steps[:, 1] ** 2, np.float32),
+        np.array([noise.read, noise.per_level, ROUNDING_VARIANCE, sample.prior,
+                  1 / (sample.prior + frames.freedom)], np.float32),
+        plan.scale,
+        np.array([least, sigmas**2, t.max_residual_sigmas**2,
+                  t.max_residual_share**2 + sample.overtone_share2(finest), t.max_remainder_sigmas**2,
+                  1 - t.min_unwrap_probability, t.edge_sigmas], np.float32),
+        plan.ladder.periodic, finest,
     )  # fmt: skip
     sigma, albedo, modulation = (m[: 0 if brief else None] for m in (maps.sigma, maps.albedo, maps.modulation))
     out = (maps.position, sigma, maps.confidence, albedo, modulation, maps.reason)
@@ -236,17 +222,24 @@ def decode_axis(
         return counts
 
     counts = np.sum(in_strips(decode, pixels, threads), axis=0)
+    found = remainders(plan.ladder, judged.steps, judged.pixels)
+    random_px, ripple, light = np.nan, None, Light((), None)
+    if not brief:
+        random_px = plan.per_cycle * judged.phase_sigma(finest)
+        light = judge_light(sample, seen, pattern.frequencies, plan)
+        light = judge_ripple(light, frames, plan, sample, pixels, clip, noise, least, sigmas)
+        if found and judged.pixels >= MIN_PIXELS:
+            ripple = _ripple(found[-1], float(plan.step_errors2[-1]), plan.per_cycle, random_px)
     settled = off_surface = 0
     if counts[Reason.UNWRAP_RISK]:
-        if steps := doubtful_steps(remainders):
+        if steps := doubtful_steps(found):
             turns = (maps.position + np.float32(pattern.origin)) * np.float32(1 / along)
             off_surface = doubt_axis(
-                frames, ladder, steps, t.clip(camera), camera.width, turns, maps.confidence, maps.reason
+                frames, plan.ladder, steps, clip, camera.width, turns, maps.confidence, maps.reason
             )
             counts[Reason.VALUE] -= off_surface
             counts[Reason.UNWRAP_RISK] += off_surface
-        per_px = float(ladder.frequencies[-1]) / along
-        settled = settle(maps.position, maps.sigma, maps.confidence, maps.reason, camera.width, per_px)
+        settled = settle(maps.position, maps.sigma, maps.confidence, maps.reason, camera.width, 1 / plan.per_cycle)
         counts[Reason.UNWRAP_RISK] -= settled
         counts[Reason.VALUE] += settled
     if counts[Reason.MOVED]:
@@ -261,7 +254,7 @@ def decode_axis(
             confidence[torn == Reason.OUT_OF_STEP] = 0
             counts += changes
     return AxisFound(
-        maps, ladder, noise, remainders, settled, off_surface, ripple, light, random_px, counts,
+        maps, plan.ladder, noise, found, settled, off_surface, ripple, light, random_px, counts,
         not brief and may_be_doubled(noise, sample.mean.reshape(-1), sample.modulations[finest].reshape(-1), frames),
     )  # fmt: skip
 
@@ -269,9 +262,3 @@ def decode_axis(
 def _ripple(last: Remainder, weight: float, per_cycle: float, random_px: float) -> Ripple:
     cycles = last.beyond_noise / float(np.sqrt(weight))
     return Ripple(cycles, per_cycle * cycles, random_px)
-
-
-def finest_of(pattern: PmpPattern) -> int:
-    """Index of the finest set."""
-    f = pattern.frequencies
-    return max(range(len(f)), key=lambda k: (f[k], k))

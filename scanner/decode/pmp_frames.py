@@ -23,12 +23,13 @@ from scanner.patterns.description import Axis
 class AxisFits:
     """What each set's frames weigh in its fit, by sets; F counts each set's up to a multiple of GROUP.
 
-    starts: (K + 1,) intp, where sets begin. weights: (3, F) float32 of A, p and q. grams: (K, 6) float32 of the normal
-    matrices. whole: (K,) shifts of sets that have all of their 4 or 8, or 0. gains: (K,) variance of (p, q) over that
-    of one sample. freedom: degrees of freedom of all sets' residuals. angles: of each set's shifts, radians; empty for
-    a set that lost some.
+    there: which of each set's frames there are. starts: (K + 1,) intp, where sets begin. weights: (3, F) float32 of A,
+    p and q. grams: (K, 6) float32 of the normal matrices. whole: (K,) shifts of sets that have all of their 4 or 8, or
+    0. gains: (K,) variance of (p, q) over that of one sample. freedom: degrees of freedom of all sets' residuals.
+    angles: of each set's shifts, radians; empty for a set that lost some.
     """
 
+    there: tuple[tuple[int, ...], ...]
     starts: NDArray[np.intp]
     weights: NDArray[np.float32]
     grams: NDArray[np.float32]
@@ -37,6 +38,11 @@ class AxisFits:
     freedom: int
     angles: tuple[NDArray[np.float64], ...]
 
+    @property
+    def shifts(self) -> tuple[int, ...]:
+        """Of each set that is whole; 0 of one that lost frames."""
+        return tuple(len(alpha) for alpha in self.angles)
+
 
 @dataclass(frozen=True)
 class AxisFrames(AxisFits):
@@ -44,11 +50,6 @@ class AxisFrames(AxisFits):
 
     frames: Sequence[NDArray[Any]]
     addresses: NDArray[np.intp]
-
-    @property
-    def shifts(self) -> tuple[int, ...]:
-        """Of each set that is whole; 0 of one that lost frames."""
-        return tuple(len(alpha) for alpha in self.angles)
 
     @property
     def like(self) -> NDArray[Any]:
@@ -69,13 +70,16 @@ def axis_frames(pattern: PmpPattern, axis: Axis, by_fringe: Mapping[int, NDArray
             have = tuple(n for n in range(fringe_set.shifts) if fringe_set.first + n in by_fringe)
             frames += [by_fringe[fringe_set.first + n] for n in have + have[:1] * (-len(have) % GROUP)]
             there.append(have)
-    fits = _fits_of(pattern, tuple(there))
+    fits = fits_of(pattern, tuple(there))
     return AxisFrames(**vars(fits), frames=frames, addresses=addresses_of(frames))
 
 
 @lru_cache(maxsize=32)
-def _fits_of(pattern: PmpPattern, there: tuple[tuple[int, ...], ...]) -> AxisFits:
-    # Every scan of a rig asks for the same, and nobody writes into it.
+def fits_of(pattern: PmpPattern, there: tuple[tuple[int, ...], ...]) -> AxisFits:
+    """What frames weigh where only those are there that `there` names, of each set of an axis; three at least.
+
+    Every scan of a rig asks for the same, and nobody writes into it.
+    """
     starts, weights, grams, whole, gains, freedom = [0], [], [], [], [], 0
     angles: list[NDArray[np.float64]] = []
     for shifts, have in zip(pattern.shifts, there, strict=True):
@@ -92,8 +96,9 @@ def _fits_of(pattern: PmpPattern, there: tuple[tuple[int, ...], ...]) -> AxisFit
         angles.append(alpha if len(have) == shifts else alpha[:0])
         starts.append(starts[-1] + len(have) + padding)
     return AxisFits(
-        np.array(starts, np.intp), np.concatenate(weights, axis=1).astype(np.float32), np.array(grams, np.float32),
-        np.array(whole, np.intp), tuple(gains), freedom, tuple(angles),
+        there, np.array(starts, np.intp),
+        np.concatenate(weights, axis=1).astype(np.float32), np.array(grams, np.float32), np.array(whole, np.intp),
+        tuple(gains), freedom, tuple(angles),
     )  # fmt: skip
 
 

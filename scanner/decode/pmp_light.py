@@ -18,20 +18,14 @@ from scanner.decode.flicker import Flicker, flicker
 from scanner.decode.harmonics import (
     SetHarmonics,
     SetSpectrum,
-    explained_by,
     named_ripple,
-    spectra_of,
     told_of,
 )
 from scanner.decode.noise import NoiseModel
 from scanner.decode.pmp_frames import AxisFrames
-from scanner.decode.pmp_sample import PRIOR_FREEDOM, Sample, take_fine_sample
+from scanner.decode.pmp_plan import AxisPlan
+from scanner.decode.pmp_sample import PRIOR_FREEDOM, THINNED, Look, Sample, take_fine_sample
 from scanner.decode.ripples import FEWEST_SHIFTS_UNHARMED, ripples
-from scanner.decode.sample_kernels import mean_of_good
-from scanner.decode.unwrapping import Ladder
-
-THINNED = 8
-"""Of the sample's runs, one in so many is asked for overtones: five hundred pixels tell a share to .0005."""
 
 LEAST_EXPLAINED = 0.02
 """Of the noise's part in the residuals: where overtones add less, the noise model is good to 1 % as it is."""
@@ -67,55 +61,42 @@ class Light:
         }
 
 
-def judge_light(
-    sample: Sample,
-    frames: AxisFrames,
-    frequencies: Sequence[float],
-    along: int,
-    least: float,
-    sigmas: float,
-    tell: bool,
-) -> tuple[Sample, Light]:
-    """The sample without what overtones are of its residuals, and what is to be told of the light.
+def honest(sample: Sample, seen: Look, frames: AxisFrames, plan: AxisPlan) -> Sample:
+    """The sample without what overtones are of its residuals, where that is more than next to nothing."""
+    noise = max(seen.left - seen.energy, 1e-6)
+    if seen.energy <= LEAST_EXPLAINED * noise:
+        return sample
+    sample = sample.without_overtones(frames, plan, seen)
+    variance = float(sample.residual[seen.good].mean()) / max(frames.freedom, 1)
+    prior = seen.energy / max(MOST_EXPLAINED * variance, 1e-6) - frames.freedom
+    return replace(sample, prior=max(PRIOR_FREEDOM, prior))
+
+
+def judge_light(sample: Sample, seen: Look, frequencies: Sequence[float], plan: AxisPlan) -> Light:
+    """What is to be told of the light.
 
     Args:
-        frequencies: by set, cycles over the projector. along: its pixels along the axis.
-        least, sigmas: modulation a pixel must have to be asked, in grey levels and over its noise.
-        tell: False where nobody asks for the light: there is nothing in it then.
+        sample: of `honest`. frequencies: by set, cycles over the projector.
     """
-    good = sample.lit(least, sigmas)
-    spectra = spectra_of(frames, sample.runs, THINNED, good, sample.mean)
-    left, count = mean_of_good(sample.residual, good, THINNED)
-    energy = sum(s.energy for s in spectra if s is not None)
-    variance = max(left - energy, 0.0) / max(frames.freedom, 1)
-    if energy > LEAST_EXPLAINED * max(left - energy, 1e-6):
-        pixels = (sample.runs[:, None] + np.arange(good.shape[1])).reshape(-1)
-        explained = explained_by(spectra, frames, pixels).reshape(good.shape)
-        residual = np.maximum(sample.residual - explained, 0)
-        variance = float(residual[good].mean()) / max(frames.freedom, 1)
-        prior = energy / max(MOST_EXPLAINED * variance, 1e-6) - frames.freedom
-        sample = replace(sample, residual=residual, prior=max(PRIOR_FREEDOM, prior), overtones=energy)
-    if not tell:
-        return sample, Light((), None)
+    spectra = seen.spectra(plan)
+    squares = float(sample.residual[seen.good].mean()) if sample.overtones else max(seen.left - seen.energy, 0.0)
+    variance = squares / max(sample.freedom, 1)
     told = (
-        told_of(float(frequency), shifts, spectrum, variance, max(count, 1))
-        for frequency, shifts, spectrum in zip(frequencies, frames.shifts, spectra, strict=True)
+        told_of(float(frequency), shifts, spectrum, variance, max(seen.count, 1))
+        for frequency, shifts, spectrum in zip(frequencies, plan.fits.shifts, spectra, strict=True)
     )
-    finest = max(range(len(frequencies)), key=lambda k: frequencies[k])
-    asked = good[::THINNED]
-    return sample, Light(tuple(told), _changes(spectra, sample, asked, variance, finest, along / frequencies[finest]))
+    asked, period_px = seen.good[::THINNED], plan.along / frequencies[plan.finest]
+    return Light(tuple(told), _changes(spectra, sample, asked, variance, plan.finest, period_px))
 
 
 def judge_ripple(
     light: Light,
     frames: AxisFrames,
+    plan: AxisPlan,
     sample: Sample,
     pixels: int,
     clip: int,
-    ladder: Ladder,
     noise: NoiseModel,
-    centre: float,
-    along: int,
     least: float,
     sigmas: float,
 ) -> Light:
@@ -125,16 +106,17 @@ def judge_ripple(
     and only many phases tell the two apart.
 
     Args:
-        pixels: of a frame. clip: see `take_sample`. The others: see `Sample.judged` and `judge_light`.
+        pixels: of a frame. clip: see `take_sample`. The others: see `Sample.judged`.
     """
     if all(s.shifts >= FEWEST_SHIFTS_UNHARMED for s in light.harmonics):
         return light
-    fine = replace(take_fine_sample(frames, pixels, sample.max_value, clip), prior=sample.prior)
+    fine = replace(take_fine_sample(frames, plan, pixels, sample.max_value, clip), prior=sample.prior)
     good = fine.good(noise, least, sigmas)
     phases = fine.phases[:, good]
     heights = np.median(fine.modulations[:, good], axis=1) if good.any() else np.zeros(len(phases), np.float32)
     shifts, frequencies = [s.shifts for s in light.harmonics], [s.frequency for s in light.harmonics]
-    found = ripples(ladder, remainders_of(ladder, phases, centre), phases, heights, shifts, frequencies, along)
+    left = remainders_of(plan.ladder, phases, plan.centre)
+    found = ripples(plan.ladder, left, phases, heights, shifts, frequencies, plan.along)
     return replace(light, harmonics=tuple(named_ripple(s, r) for s, r in zip(light.harmonics, found, strict=True)))
 
 

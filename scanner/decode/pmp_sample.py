@@ -7,19 +7,21 @@ by side can be compared.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.agreement import PAIR_DISTANCE, Remainder, agreement, noise_of_pairs
+from scanner.decode.agreement import PAIR_DISTANCE, folded_medians, noise_of_pairs
+from scanner.decode.harmonics import SetSpectrum, SpectraSums
 from scanner.decode.middles import nth_of
-from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel, default_noise, fit_noise
+from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel, default_noise
 from scanner.decode.pmp_frames import AxisFrames
+from scanner.decode.pmp_plan import AxisPlan
 from scanner.decode.pmp_sums import fit_runs
 from scanner.decode.runs import runs_of, spread_runs
-from scanner.decode.sample_kernels import count_lit, mark_good, take_good
-from scanner.decode.unwrapping import Ladder
+from scanner.decode.sample_kernels import judge, look, mark_good
+from scanner.decode.spectra import take_explained_off
 
 SIZE = 4096
 """Pixels of a first sample: the median of a twelfth of it is good to 5 %, its noise model to 2 %."""
@@ -34,6 +36,9 @@ of a run share their surface: fewer are a handful of places, and what these have
 
 FINE_RUN = 8
 """Pixels of a run where places count more than memory read: five hundred phases of fringes that run along rows"""
+
+THINNED = 8
+"""Of the sample's runs, one in so many is asked for overtones: five hundred pixels tell a share to .0005."""
 
 _GROWTH = 8
 PRIOR_FREEDOM = 8.0
@@ -62,43 +67,36 @@ class Sample:
     prior: float = PRIOR_FREEDOM
     overtones: float = 0.0
 
-    def brightest(self, finest: int) -> float:
-        """99th percentile of the finest set's modulation, grey levels."""
-        b = self.modulations[finest].reshape(-1)
-        return float(nth_of(b, int(0.99 * (b.size - 1))))
+    def judged(self, plan: AxisPlan, least: float, sigmas: float, floor: float) -> Judged:
+        """Noise and agreement, from pixels that are not clipped, and good by that noise.
 
-    def noise(self, ladder: Ladder, centre: float, least: float, sigmas: float) -> NoiseModel:
-        """The scan's noise model, from residuals; where fits leave none (three shifts), from pairs of pixels.
+        The noise is that of residuals; where fits leave none (three shifts), of pairs of pixels.
 
         Args:
-            centre: the field's centre, fraction of it. least, sigmas: modulation a usable pixel of a pair has, in grey
-                levels and over its noise.
+            least, sigmas: modulation a pixel must have, in grey levels and over its noise. floor: least systematic
+                sigma of a set's phase, cycles.
         """
-        if self.freedom:
-            mean, residual = self.mean.reshape(-1), self.residual.reshape(-1)
-            if not self.usable.all():
-                usable = np.flatnonzero(self.usable)
-                mean, residual = mean.take(usable), residual.take(usable)
-            return fit_noise(mean, residual, self.freedom, self.max_value)
-        good = self.good(default_noise(self.max_value), least, sigmas)
-        pair = good[:, :-PAIR_DISTANCE] & good[:, PAIR_DISTANCE:]
-        pixels = slice(None, -PAIR_DISTANCE), slice(PAIR_DISTANCE, None)
-        phases = np.stack([self.phases[:, :, at][:, pair] for at in pixels])
-        gains = self.gains[:, None] / np.float32(4 * np.pi**2)
-        per_variance = np.stack([gains / self.modulations[:, :, at][:, pair] ** 2 for at in pixels])
-        level = (self.mean[:, pixels[0]][pair] + self.mean[:, pixels[1]][pair]) * np.float32(0.5)
-        return noise_of_pairs(ladder, phases, per_variance, level, centre, self.max_value)
-
-    def judged(self, noise: NoiseModel, least: float, sigmas: float) -> Judged:
-        """The `good` ones."""
-        sets = len(self.gains)
-        good, variance, count = self._marked(noise, least, sigmas)
-        phases, modulations = self.phases.reshape(sets, -1), self.modulations.reshape(sets, -1)
-        return Judged(*take_good(phases, modulations, variance, self.gains, good, count))
+        sets, steps = len(self.gains), np.empty((len(plan.errors2), 4))
+        noise = default_noise(self.max_value) if self.freedom else self._noise_of_pairs(plan, least, sigmas)
+        weights = self._weights(noise)
+        cycles2, fitted = judge(
+            self.phases.reshape(sets, -1), self.modulations.reshape(sets, -1), self.mean.reshape(-1),
+            self.residual.reshape(-1), self.usable.reshape(-1), self.gains, self.freedom > 0, weights,
+            _limits(least, sigmas), plan.combinations, plan.ladder.frequencies, plan.errors2, plan.centre,
+            folded_medians(), floor, steps,
+        )  # fmt: skip
+        if fitted:
+            noise = NoiseModel(float(weights[0]), float(weights[1]), measured=True)
+        return Judged(noise, steps, cycles2)
 
     def good(self, noise: NoiseModel, least: float, sigmas: float) -> NDArray[np.bool_]:
         """(R, L) bool: pixels not clipped whose sets all have `least` modulation, and `sigmas` times its noise."""
-        return self._marked(noise, least, sigmas)[0].reshape(self.mean.shape)
+        good, variance = np.empty(self.mean.size, np.bool_), np.empty(self.mean.size, np.float32)
+        mark_good(
+            self.modulations.reshape(len(self.gains), -1), self.mean.reshape(-1), self.residual.reshape(-1),
+            self.usable.reshape(-1), self.gains, self._weights(noise), _limits(least, sigmas), variance, good,
+        )  # fmt: skip
+        return good.reshape(self.mean.shape)
 
     def overtone_share2(self, finest: int) -> float:
         """Mean square that overtones leave at the worst phase, over the finest set's B^2 of a typical pixel."""
@@ -107,35 +105,64 @@ class Sample:
         typical = float(np.median(self.modulations[finest][self.usable] ** 2)) if self.usable.any() else 0.0
         return 2 * self.overtones / max(self.freedom * typical, 1e-6)
 
-    def lit(self, least: float, sigmas: float) -> NDArray[np.bool_]:
-        """The same before anything is known of the noise: by that of any camera, whatever the residuals."""
-        return self._marked(default_noise(self.max_value), least, sigmas, trusting=False)[0].reshape(self.mean.shape)
-
-    def _marked(
-        self, noise: NoiseModel, least: float, sigmas: float, trusting: bool = True
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float32], int]:
-        """(n,) which are good, (n,) variance of one sample, and how many are. trusting: residuals count."""
-        weights = (self.prior, self.freedom, 1) if trusting else (1, 0, 0)
-        good, variance = np.empty(self.mean.size, np.bool_), np.empty(self.mean.size, np.float32)
-        count = mark_good(
-            self.modulations.reshape(len(self.gains), -1), self.mean.reshape(-1), self.residual.reshape(-1),
-            self.usable.reshape(-1), self.gains,
-            np.array([noise.read, noise.per_level, ROUNDING_VARIANCE, *weights], np.float32),
-            np.array([sigmas**2, max(least**2, 1e-12)], np.float32), variance, good,
+    def without_overtones(self, frames: AxisFrames, plan: AxisPlan, seen: Look) -> Sample:
+        """The sample without what overtones are of its residuals: they are the same at every pixel, noise is not."""
+        residual = self.residual.copy()
+        take_explained_off(
+            frames.addresses, frames.like, frames.starts, plan.heights.weights, plan.heights.kinds, seen.sums.ratios,
+            self.runs, residual,
         )  # fmt: skip
-        return good, variance, count
+        return replace(self, residual=residual, overtones=seen.energy)
+
+    def _weights(self, noise: NoiseModel) -> NDArray[np.float32]:
+        """Of `mark_good`, where residuals count."""
+        return np.array([noise.read, noise.per_level, ROUNDING_VARIANCE, self.prior, self.freedom, 1], np.float32)
+
+    def _noise_of_pairs(self, plan: AxisPlan, least: float, sigmas: float) -> NoiseModel:
+        good = self.good(default_noise(self.max_value), least, sigmas)
+        pair = good[:, :-PAIR_DISTANCE] & good[:, PAIR_DISTANCE:]
+        pixels = slice(None, -PAIR_DISTANCE), slice(PAIR_DISTANCE, None)
+        phases = np.stack([self.phases[:, :, at][:, pair] for at in pixels])
+        gains = self.gains[:, None] / np.float32(4 * np.pi**2)
+        per_variance = np.stack([gains / self.modulations[:, :, at][:, pair] ** 2 for at in pixels])
+        level = (self.mean[:, pixels[0]][pair] + self.mean[:, pixels[1]][pair]) * np.float32(0.5)
+        return noise_of_pairs(plan.ladder, phases, per_variance, level, plan.centre, self.max_value)
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a first look at a sample shows, by the noise of any camera.
+
+    least: grey levels of modulation that a pixel must have. good: (R, L) bool, those that have it. sums: spectra of
+    `count` good pixels, of one run in THINNED. left: mean of these pixels' squared residuals; energy: what overtones of
+    a response are of it, grey levels squared.
+    """
+
+    least: float
+    good: NDArray[np.bool_]
+    sums: SpectraSums
+    count: int
+    left: float
+    energy: float
+
+    def spectra(self, plan: AxisPlan) -> tuple[SetSpectrum | None, ...]:
+        """By set."""
+        return self.sums.spectra(plan.heights, self.count)
 
 
 @dataclass(frozen=True)
 class Judged:
-    """Pixels of a sample that are good. phases: (K, n) float32, cycles. cycles2: (K, n) float32, their variances."""
+    """The scan's noise; steps: (J - 1, 4) of `judge_steps`; cycles2: (K, n) float32, variances of good pixels' phases,
+    cycles squared."""
 
-    phases: NDArray[np.float32]
+    noise: NoiseModel
+    steps: NDArray[np.float64]
     cycles2: NDArray[np.float32]
 
-    def agreement(self, ladder: Ladder, centre: float, floor_cycles: float) -> list[Remainder]:
-        """How well the ladder's rungs agree."""
-        return agreement(ladder, self.phases, self.cycles2, centre, floor_cycles)
+    @property
+    def pixels(self) -> int:
+        """How many were good."""
+        return int(self.cycles2.shape[1])
 
     def phase_sigma(self, finest: int) -> float:
         """Random 1-sigma of the finest set's phase, cycles, median; NaN without any."""
@@ -145,38 +172,56 @@ class Judged:
         return float(np.sqrt(nth_of(of_set, of_set.size // 2)))
 
 
-def take_sample(frames: AxisFrames, pixels: int, max_value: int, clip: int, least: float) -> Sample:
-    """A sample that has light in it, if the image has.
+def take_sample(
+    frames: AxisFrames, plan: AxisPlan, pixels: int, max_value: int, clip: int, modulation: tuple[float, float, float]
+) -> tuple[Sample, Look]:
+    """A sample that has light in it, if the image has, and what it shows.
 
     Args:
-        pixels: of a frame. clip: grey level from which a sample counts as saturated. least: grey levels of modulation
-            that count as light.
+        pixels: of a frame. clip: grey level from which a sample counts as saturated. modulation: that a pixel must
+            have: grey levels that count as light, share of the brightest (99th percentile of the finest set), and over
+            its noise.
     """
+    any_noise = default_noise(max_value)
+    noise = np.array([any_noise.read, any_noise.per_level, ROUNDING_VARIANCE, 1, 0, 0], np.float32)
+    thresholds, heights = np.array(modulation, np.float32), plan.heights
     size = SIZE if frames.freedom else PAIRS_SIZE
     while True:
-        sample = _fit(frames, *runs_of(pixels, size), max_value, clip)
-        modulations = sample.modulations.reshape(len(frames.gains), -1)
-        lit = count_lit(modulations, sample.usable.reshape(-1), np.float32(least))
+        runs, length = runs_of(pixels, size)
+        sample, good = _empty(plan, runs, length, max_value), np.empty((runs.size, length), np.bool_)
+        sums = SpectraSums.empty(len(plan.gains))
+        lit, least, count, left, energy = look(
+            frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, frames.whole, plan.gains,
+            clip, pixels, runs, length, THINNED, plan.finest, noise, thresholds, heights.weights, heights.kinds,
+            sample.phases, sample.modulations, sample.mean, sample.residual, sample.usable, good,
+            sums.sums, sums.levels, sums.ratios,
+        )  # fmt: skip
         if lit >= ENOUGH or size >= pixels:
-            return sample
+            return sample, Look(least, good, sums, count, left, energy)
         size *= _GROWTH
 
 
-def take_fine_sample(frames: AxisFrames, pixels: int, max_value: int, clip: int) -> Sample:
+def take_fine_sample(frames: AxisFrames, plan: AxisPlan, pixels: int, max_value: int, clip: int) -> Sample:
     """A sample of as many pixels as a first one has, in runs of FINE_RUN: many places, of few pixels each."""
-    return _fit(frames, *spread_runs(pixels, SIZE, FINE_RUN), max_value, clip)
-
-
-def _fit(frames: AxisFrames, runs: NDArray[np.intp], length: int, max_value: int, clip: int) -> Sample:
-    sets, shape = len(frames.gains), (runs.size, length)
-    phases, modulations = (np.empty((sets, runs.size * length), np.float32) for _ in range(2))
-    mean, residual = (np.empty(runs.size * length, np.float32) for _ in range(2))
-    clipped = np.empty(runs.size * length, np.bool_)
+    runs, length = spread_runs(pixels, SIZE, FINE_RUN)
+    sample, sets = _empty(plan, runs, length, max_value), len(plan.gains)
     fit_runs(
-        frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, frames.whole, clip,
-        frames.frames[0].size, runs, length, phases, modulations, mean, residual, clipped,
+        frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, frames.whole, clip, pixels,
+        runs, length, sample.phases.reshape(sets, -1), sample.modulations.reshape(sets, -1), sample.mean.reshape(-1),
+        sample.residual.reshape(-1), sample.usable.reshape(-1),
     )  # fmt: skip
-    return Sample(
-        phases.reshape(sets, *shape), modulations.reshape(sets, *shape), mean.reshape(shape), residual.reshape(shape),
-        ~clipped.reshape(shape), np.array(frames.gains, np.float32), frames.freedom, max_value, runs,
-    )  # fmt: skip
+    np.logical_not(sample.usable, out=sample.usable)
+    return sample
+
+
+def _empty(plan: AxisPlan, runs: NDArray[np.intp], length: int, max_value: int) -> Sample:
+    """To be written."""
+    shape, sets = (runs.size, length), len(plan.gains)
+    phases, modulations = np.empty((sets, *shape), np.float32), np.empty((sets, *shape), np.float32)
+    mean, residual, usable = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.bool_)
+    return Sample(phases, modulations, mean, residual, usable, plan.gains, plan.fits.freedom, max_value, runs)
+
+
+def _limits(least: float, sigmas: float) -> NDArray[np.float32]:
+    """Of `mark_good`."""
+    return np.array([sigmas**2, max(least**2, 1e-12)], np.float32)

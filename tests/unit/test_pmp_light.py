@@ -7,9 +7,10 @@ import pytest
 
 from scanner.decode import Reason, decoder_for
 from scanner.decode.agreement import remainders_of
-from scanner.decode.harmonics import height_weights, spectra_of
+from scanner.decode.harmonics import HeightWeights, SpectraSums
 from scanner.decode.pmp_frames import axis_frames
 from scanner.decode.ripples import ripples
+from scanner.decode.spectra import of_response, sum_sets, take_explained_off
 from scanner.decode.unwrapping import plan_ladder
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
 from scanner.ripple_correction import widen_by_ripple, without_ripple
@@ -48,6 +49,17 @@ def of_set(found, k=-1):
     return found.details["light"]["y"]["harmonics"][k]
 
 
+def spectra_of(frames, runs, every, good, level):
+    """(spectrum by set, energy of a pixel, HeightWeights, sums) of one run in `every`."""
+    heights, found = HeightWeights.of(frames), SpectraSums.empty(len(frames.gains))
+    energy = sum_sets(
+        frames.addresses, frames.like, frames.starts, heights.weights, heights.kinds, runs, every, good, level,
+        found.sums, found.levels, found.ratios,
+    )  # fmt: skip
+    count = np.count_nonzero(good[::every])
+    return found.spectra(heights, count), energy / max(count, 1), heights, found
+
+
 def shares_of(exponent):
     """Of the overtones 2, 3, 4 in the fringe, by Fourier transform."""
     light = (0.5 + 0.48 * np.cos(2 * np.pi * np.arange(4096) / 4096)) ** exponent
@@ -67,7 +79,7 @@ def test_the_kernel_sums_what_the_plain_form_does(shifts, bits):
     good = np.random.default_rng(1).random((runs.size, length)) < 0.7
     samples = np.stack([frame.reshape(-1)[pixels] for frame in frames])[:, good[::2].reshape(-1)].astype(float)
     level = np.broadcast_to(np.mean(frames, axis=(0, 1, 2)).astype(np.float32), good.shape).copy()
-    (found,) = spectra_of(of_axis, runs, 2, good, level)
+    (found,), energy, kinds, sums = spectra_of(of_axis, runs, 2, good, level)
     alpha = of_axis.angles[0]
     heights = 2 / shifts * np.exp(-1j * np.arange(1, 5)[:, None] * alpha) @ samples
     assert found.power == pytest.approx(np.mean(np.abs(heights[0]) ** 2), rel=1e-5)
@@ -83,7 +95,24 @@ def test_the_kernel_sums_what_the_plain_form_does(shifts, bits):
             rest = np.mean(seen - expected * meant)
         assert ratio == pytest.approx(expected, abs=1e-4)
         assert left == pytest.approx(rest / level[0, 0], abs=1e-4)
-    assert height_weights(alpha).dtype == np.float32
+    # What is explained of residuals, pixel by pixel; its mean is known from the sums alone.
+    samples = np.stack([frame.reshape(-1)[pixels] for frame in frames]).astype(float)
+    heights, explained = 2 / shifts * np.exp(-1j * np.arange(1, 5)[:, None] * alpha) @ samples, np.zeros(pixels.size)
+    for order, ratio in enumerate(found.ratios, start=2):
+        meant, seen = heights[0] * np.exp(1j * (order - 1) * np.angle(heights[0])) * ratio, heights[order - 1]
+        if 2 * order == shifts:
+            seen, meant = (seen * np.exp(1j * order * alpha[0])).real / 2**0.5, meant.real * 2**0.5
+        explained += shifts / 2 * (2 * (np.conj(meant) * seen).real - np.abs(meant) ** 2)
+    top = 2 * np.abs(explained).max() + 1
+    residual = np.full((runs.size, length), top, np.float32)
+    axis = of_axis.addresses, of_axis.like, of_axis.starts, kinds.weights, kinds.kinds, sums.ratios
+    take_explained_off(*axis, runs, residual)
+    assert np.allclose(top - residual[::2].reshape(-1), explained, atol=1e-4 * top)
+    # With four shifts it counts on all phases being there alike: a ninth of a period is not, in these images.
+    around = 0.15 if shifts == 4 else 0.02
+    assert energy == pytest.approx(explained[good[::2].reshape(-1)].mean(), rel=around, abs=0.01)
+    take_explained_off(*axis, runs, residual := np.zeros_like(residual))
+    assert residual.min() == 0
 
 
 @pytest.mark.parametrize("exponent", [0.7, 1.0, 1.15, 2.2])
@@ -144,9 +173,10 @@ def test_frames_that_changed_places_are_no_response():
     frames[5], frames[6] = frames[6], frames[5]
     of_axis = axis_frames(pattern, "y", dict(enumerate(frames)))
     good = np.ones((100, 64), np.bool_)
-    spectra = spectra_of(of_axis, np.arange(100) * 300, 1, good, np.full(good.shape, 90, np.float32))
-    assert [s.of_response for s in spectra] == [True, False, True]
-    assert spectra[1].energy == 0
+    spectra, energy, _, _ = spectra_of(of_axis, np.arange(100) * 300, 1, good, np.full(good.shape, 90, np.float32))
+    assert [of_response(np.array(s.ratios)) for s in spectra] == [True, False, True]
+    # Of order two, which is N / 2 here, half is seen, and weighs twice.
+    assert energy == pytest.approx(sum(2 * abs(s.ratios[0]) ** 2 * s.power for s in (spectra[0], spectra[2])))
 
 
 def test_sets_that_lost_frames_and_dark_images_tell_nothing():
@@ -157,10 +187,10 @@ def test_sets_that_lost_frames_and_dark_images_tell_nothing():
     assert of_axis.shifts == (0, 8)
     good = np.ones((100, 64), np.bool_)
     level = np.full(good.shape, 90, np.float32)
-    lost, whole = spectra_of(of_axis, np.arange(100) * 300, 1, good, level)
+    (lost, whole), _, heights, sums = spectra_of(of_axis, np.arange(100) * 300, 1, good, level)
     assert lost is None
     assert whole is not None
-    assert spectra_of(of_axis, np.arange(100) * 300, 1, good & False, level) == (None, None)
+    assert sums.spectra(heights, 127) == (None, None)
     dark = decoded(pattern, [np.full(CAMERA.shape, 5, np.uint8)] * 16)
     assert of_set(dark)["second"] is None
     assert dark.details["light"]["y"]["flicker"] is None

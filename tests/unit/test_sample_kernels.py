@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scanner.decode.agreement import agreement, remainders_of
+from scanner.decode.agreement import folded_medians, remainders, remainders_of
 from scanner.decode.middles import middle_of_squares, middles_of_bins, nth_of, order_of
-from scanner.decode.noise import NoiseModel
+from scanner.decode.noise import fit_noise
+from scanner.decode.pmp_plan import plan_axis, whole_sets
 from scanner.decode.pmp_sample import Sample
-from scanner.decode.sample_kernels import mean_of_good
+from scanner.decode.sample_kernels import BINS, MIN_PIXELS, judge_steps, mean_of_good
 from scanner.decode.unwrapping import plan_ladder
-
-BINS = 8
+from scanner.patterns import PmpPattern
 
 
 def numbers(size, seed=0, steps=24):
@@ -28,6 +28,12 @@ def test_numbers_come_in_their_order_and_equal_ones_as_they_were(size):
     assert np.array_equal(order, np.argsort(keys, kind="stable"))
     for n in (0, size // 3, size - 1):
         assert nth_of(keys, n) == keys[order[n]]
+
+
+def test_an_order_is_good_to_a_ten_thousandth_whatever_lies_far_out():
+    keys = np.random.default_rng(2).uniform(100, 101, 5000).astype(np.float32)
+    keys[7], keys[4000] = 1e-30, 1e30
+    assert np.allclose(keys[order_of(keys)], np.sort(keys), rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("size", [100, 4099])
@@ -70,10 +76,13 @@ def sample(size=2048, seed=0):
     )
 
 
-def test_good_pixels_are_those_of_the_plain_form():
-    noise, least, sigmas = NoiseModel(1.5, 0.02, measured=True), 3.0, 7.0
-    drawn = sample()
-    judged = drawn.judged(noise, least, sigmas)
+def test_a_sample_is_judged_as_in_the_plain_form():
+    drawn, least, sigmas = sample(), 3.0, 7.0
+    pattern = PmpPattern(("y",), (1.0, 8.0, 64.0), (8, 8, 8))
+    judged = drawn.judged(plan_axis(pattern, 500, whole_sets(pattern)), least, sigmas, 0.001)
+    noise = judged.noise
+    alone = fit_noise(drawn.mean[drawn.usable], drawn.residual[drawn.usable], drawn.freedom, 255)
+    assert [noise.read, noise.per_level] == pytest.approx([alone.read, alone.per_level])
 
     model = noise.variance(drawn.mean)
     own = (np.float32(drawn.prior) * model + drawn.residual) / np.float32(drawn.prior + drawn.freedom)
@@ -86,9 +95,24 @@ def test_good_pixels_are_those_of_the_plain_form():
     assert mean == pytest.approx(drawn.residual[::8][good[::8]].mean(), rel=1e-5)
     assert mean_of_good(drawn.residual, np.zeros_like(good), 8) == (0.0, 0)
     assert np.array_equal(drawn.good(noise, least, sigmas), good)
-    assert np.array_equal(judged.phases, drawn.phases[:, good])
     cycles2 = (variance / np.float32(4 * np.pi**2))[:, good] / drawn.modulations[:, good] ** 2
     assert np.allclose(judged.cycles2, cycles2, rtol=1e-6, atol=0)
+    steps = np.empty((2, 4))
+    judge(plan_ladder(pattern.frequencies, [0.25] * 3), drawn.phases[:, good], judged.cycles2, steps, 0.001)
+    assert np.allclose(judged.steps, steps, rtol=1e-4, atol=1e-6)
+
+
+def judge(ladder, phases, cycles2, steps, floor=0.0):
+    errors2 = (ladder.errors**2).astype(np.float32)
+    combinations = ladder.combinations.astype(float)
+    judge_steps(phases, cycles2, combinations, ladder.frequencies, errors2, 0.5, folded_medians(), floor, steps)
+
+
+def test_few_pixels_say_nothing_of_steps():
+    phases = np.zeros((3, MIN_PIXELS - 1), np.float32)
+    steps = np.empty((2, 4))
+    judge(plan_ladder((1, 8, 64), [0.25] * 3), phases, phases + 1, steps, 0.01)
+    assert np.array_equal(steps, [[0, 0.01, 0, 0]] * 2)
 
 
 @pytest.mark.parametrize("frequencies", [(1, 8, 64), (59, 64, 70)])
@@ -98,7 +122,8 @@ def test_steps_are_judged_as_in_the_plain_form(frequencies):
     cycles2 = random.uniform(1e-5, 1e-4, (3, 3001)).astype(np.float32)
     seen = np.array(frequencies)[:, None] * random.uniform(0.1, 0.9, 3001) + random.normal(0, np.sqrt(cycles2) * 1.5)
     phases = ((seen + 0.5) % 1 - 0.5).astype(np.float32)
-    found = agreement(ladder, phases, cycles2, 0.5, 0.0)
+    judge(ladder, phases, cycles2, steps := np.empty((len(ladder.errors), 4)))
+    found = remainders(ladder, steps, phases.shape[1])
 
     for j, remainder in enumerate(remainders_of(ladder, phases, 0.5)):
         errors2 = (ladder.errors[j] ** 2).astype(np.float32)
