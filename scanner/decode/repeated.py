@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from scanner.decode import Decoded, Map, Reason
 
@@ -26,6 +27,10 @@ sigma at R = 2, JCGM 100:2008 table E.1, and the median over an image is far bet
 CONTRADICTING = 5.0
 """Scatter of one pixel above so many times its stated sigma is no noise either: of normal noise a pixel of two million
 has it at R = 2, and fewer with more repetitions."""
+
+CLASSES, FEWEST_OF_CLASS = 10, 100
+"""Of pixels, by stated sigma, that say whether scatter grows with it; and how many each must have, for a median that is
+good to a fifth at R = 2."""
 
 
 class Repetitions:
@@ -80,10 +85,10 @@ class Repetitions:
         """The mean.
 
         A pixel has a value where more than half of the repetitions gave one, none of them a fringe or stripe away
-        from the others; its sigma is that of the weighted mean (of rounding: that of one), widened by the ratio of what
-        the repetitions scatter to what they state (Birge 1932, Phys. Rev. 40, 207) where that is no noise: of the
-        image, if it is above UNSTEADY, and of the pixel, if it is above CONTRADICTING. Peaks and stripes are those of
-        the first repetition.
+        from the others; its sigma is that of the weighted mean (of rounding: that of one), widened by what the
+        repetitions scatter beyond what they state where that is no noise: of the image, if the ratio is above UNSTEADY,
+        by what is alike in all pixels and by what grows with their sigmas (`Scatter`); of the pixel, if its own ratio
+        (Birge 1932, Phys. Rev. 40, 207) is above CONTRADICTING. Peaks and stripes are those of the first repetition.
 
         Raises:
             ValueError: nothing was added.
@@ -134,12 +139,19 @@ class Repetitions:
 
 @dataclass(frozen=True)
 class Scatter:
-    """How repetitions of one axis agreed: medians over the pixels that all of them gave, px."""
+    """How repetitions of one axis agreed: medians over the pixels that all of them gave, px.
+
+    What one repetition scatters has two parts: `common_px`, alike in all pixels, as where the scene moved, and `factor`
+    (1 at least) times what each pixel states, as where noise is more than believed. Noisy pixels have no more of the
+    former than others. It comes once per repetition: R of them tell it with R - 1 freedoms, however many the pixels.
+    """
 
     measured_px: float
     """standard deviation of one repetition, from the repetitions themselves"""
     stated_px: float
     """the decoder's own sigma of one repetition"""
+    common_px: float
+    factor: float
 
     @property
     def ratio(self) -> float:
@@ -148,7 +160,13 @@ class Scatter:
 
     def as_dict(self) -> dict[str, float]:
         """For report.json."""
-        return {"measured_px": self.measured_px, "stated_px": self.stated_px, "ratio": self.ratio}
+        return {
+            "measured_px": self.measured_px,
+            "stated_px": self.stated_px,
+            "ratio": self.ratio,
+            "common_px": self.common_px,
+            "factor": self.factor,
+        }
 
 
 class _AxisSums:
@@ -177,13 +195,17 @@ class _AxisSums:
         self.squares += apart * apart
         self.count += use
 
-    def mean(self, keep: NDArray[np.bool_], *, quantised: bool, unsteady: float = 1.0) -> tuple[Map, Map]:
-        """Weighted mean and its sigma, NaN where not kept; `unsteady`: what all sigmas are widened by at least."""
+    def mean(self, keep: NDArray[np.bool_], *, quantised: bool, unsteady: Scatter | None = None) -> tuple[Map, Map]:
+        """Weighted mean and its sigma, NaN where not kept; `unsteady`: by what all sigmas are widened at least."""
         here = keep & (self.weight > 0)
         values, sigmas = np.full_like(self.origin, np.nan), np.full_like(self.origin, np.nan)
         values[here] = self.origin[here] + self.weighted[here] / self.weight[here]
-        sigmas[here] = np.sqrt((self.count[here] if quantised else np.float32(1)) / self.weight[here])
-        sigmas[here] *= np.maximum(self._widening(here), np.float32(unsteady))
+        stated = np.sqrt((self.count[here] if quantised else np.float32(1)) / self.weight[here])
+        sigmas[here] = stated * self._widening(here)
+        if unsteady is not None:
+            common = np.float32(unsteady.common_px) / np.sqrt(self.count[here].astype(np.float32))
+            wide = np.hypot(stated * np.float32(unsteady.factor), common)
+            sigmas[here] = np.maximum(sigmas[here], wide)
         return values, sigmas
 
     def _widening(self, here: NDArray[np.bool_]) -> Map:
@@ -204,12 +226,34 @@ class _AxisSums:
         variance = np.maximum(self.squares[here] - plain * plain / n, 0) / (n - 1)
         # The mean of chi-square over its degrees of freedom is 1, its median is not: Wilson and Hilferty (1931).
         of_median = (1 - 2 / (9 * (most - 1))) ** 3
-        stated = np.sqrt(n / self.weight[here])
-        return Scatter(float(np.sqrt(np.median(variance) / of_median)), float(np.median(stated)))
+        stated = n / self.weight[here]
+        common, factor = _parts(variance / of_median, stated)
+        return Scatter(
+            float(np.sqrt(np.median(variance) / of_median)), float(np.sqrt(np.median(stated))), common, factor
+        )
 
 
-def _unsteady(scatter: Scatter | None) -> float:
-    return scatter.ratio if scatter is not None and UNSTEADY < scatter.ratio < float("inf") else 1.0
+def _parts(variance: Map, stated: Map) -> tuple[float, float]:
+    """common_px and factor of `Scatter`, by the medians of classes of pixels with like stated variance.
+
+    Args:
+        variance, stated: (n,) px^2 of one repetition.
+    """
+    edges = np.quantile(stated, np.linspace(0, 1, max(min(CLASSES, len(stated) // FEWEST_OF_CLASS), 1) + 1))
+    of = np.clip(np.searchsorted(edges, stated, side="right") - 1, 0, len(edges) - 2)
+    classes = [of == k for k in range(len(edges) - 1)]
+    medians = [(np.median(stated[one]), np.median(variance[one])) for one in classes if one.any()]
+    believed, seen = np.array(medians, dtype=np.float64).T
+    scale = np.maximum(seen, np.finfo(np.float64).tiny ** 0.5)
+    # The noise that is stated is there in any case: what is fitted is what comes on top of it.
+    terms = np.column_stack((believed, np.ones_like(believed))) / scale[:, None]
+    (more, alike), _ = nnls(terms, (seen - believed) / scale)
+    return float(np.sqrt(alike)), float(np.sqrt(1 + more))
+
+
+def _unsteady(scatter: Scatter | None) -> Scatter | None:
+    """A scatter that is no noise as stated."""
+    return scatter if scatter is not None and UNSTEADY < scatter.ratio < float("inf") else None
 
 
 def _warnings(found: Mapping[str, Scatter | None]) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -73,6 +75,23 @@ def test_a_scene_that_moved_is_said():
     # Four at 0, .5, 1 and 1.5: their standard deviation over the root of four is what the mean is good for.
     assert np.median(mean.sigma_rows) == pytest.approx(np.hypot(np.std([0, 0.5, 1, 1.5], ddof=1), SIGMA) / 2, rel=0.15)
     assert mean.sigma_rows.min() > 3 * SIGMA / 2
+
+
+def test_what_moved_all_pixels_alike_does_not_multiply_their_noise():
+    random = np.random.default_rng(8)
+    stated = SIGMA / 3 * np.exp(random.normal(0, 0.8, SHAPE))
+    for offsets, noise in ((random.normal(0, 0.5, 8), 1.0), (np.zeros(8), 3.0)):
+        decodings = []
+        for offset in offsets:
+            one = decoding(random, sigma=1.0)
+            rows = np.linspace(100, 160, stated.size).reshape(SHAPE) + offset + noise * random.normal(0, stated)
+            decodings.append(replace(one, rows=rows.astype(np.float32), sigma_rows=stated.astype(np.float32)))
+        mean = mean_of(decodings)
+        common = np.std(offsets, ddof=1)
+        wanted = np.sqrt((noise * stated) ** 2 + common**2) / np.sqrt(8)
+        quiet, noisy = stated < np.median(stated), stated > np.quantile(stated, 0.9)
+        for part in (quiet, noisy):
+            assert np.median(mean.sigma_rows[part] / wanted[part]) == pytest.approx(1, abs=0.1)
 
 
 def test_a_part_that_moved_has_sigmas_of_its_own():
