@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -145,6 +146,21 @@ def test_the_order_of_neighbours_is_asked_where_there_are_any() -> None:
     found = [agreement_of(path) for path in ([3, 4, 5, 9, 10], [3, 9, 1, 14, 7])]
     assert [round(each.order, 2) for each in found] == [0.75, 0.0]
     assert agreement_of([3]).order == 1.0
+
+
+@pytest.mark.parametrize(("brightness", "cause"), [(90, "contradict the description"), (4, "cannot be read")])
+def test_codes_that_are_not_read_do_not_accuse_the_description(brightness: float, cause: str) -> None:
+    described = McpPattern()
+    shown = replace(described, codes=tuple(int(c) for c in np.random.default_rng(0).permutation(described.codes)))
+    light = cv2.resize(shown.fringe(0, PROJECTOR).astype(np.float32), (CAMERA.width, CAMERA.height))
+    image = 10 + brightness * light + np.random.default_rng(2).normal(0, 1, light.shape)
+    with pytest.raises(DecodeError, match=cause) as refused:
+        decode_image(np.rint(image).astype(np.uint8), described, PROJECTOR, CAMERA)
+    assert "bits, carriers, codes and axis of the description" in refused.value.hint
+    if brightness < 10:
+        assert "2% are needed" in str(refused.value)
+        assert "1 of 255 grey levels bright" in str(refused.value)
+        assert refused.value.hint.startswith("more light on the surface, or a longer exposure")
 
 
 def agreement_of(path: list[int]) -> description.Agreement:

@@ -14,6 +14,7 @@ from scanner.crossings import Crossings, crossings_of, turned_over
 from scanner.decode import Decoded
 from scanner.decode.frames import FrameCheck
 from scanner.decode.mcp.decision import Decision, decide
+from scanner.decode.mcp.description import LEAST_CLEAR, Agreement
 from scanner.decode.mcp.door import turned, turned_back, upright_image, upside_down
 from scanner.decode.mcp.locate import Array, Found, Image, Known, Stages, locate
 from scanner.decode.mcp.maps import fill_rows, maps_of
@@ -112,6 +113,17 @@ def positions_next(
     return rows if pattern.axis == "y" else turned(rows), learnt
 
 
+CHECK = "check bits, carriers, codes and axis of the description against what is projected"
+UNREAD = (
+    "stripes are there, but their codes cannot be read: light, contrast or resolution are too low, or print outshines "
+    "the carriers"
+)
+MORE_LIGHT = (
+    "more light on the surface, or a longer exposure, and less light from elsewhere; a camera picture of more pixels, "
+    "or nearer; fewer codes (bits) or lower carriers; PMP for surfaces in black and white"
+)
+
+
 @dataclass(frozen=True, eq=False)
 class _Seen:
     """An image whose stripes have been decided; `image` is upright: stripes horizontal, the first one above."""
@@ -172,7 +184,7 @@ def _see_anew(upright: Image, model: PatternModel, camera: CameraFormat, crossin
     found = locate(upright, model, camera, clock)
     if found.fault is not None:
         _explain(found, upright, model, camera)
-    decided = decide(found, model, clock, crossings)
+    first, decided = found, decide(found, model, clock, crossings)
     if decided.agreement.holds:
         return _Seen(upright, found, decided, model, False, clock)
     # The projector may hang upside down: then the stripes' order is reversed.
@@ -183,19 +195,33 @@ def _see_anew(upright: Image, model: PatternModel, camera: CameraFormat, crossin
     if again.agreement.holds:
         return _Seen(reversed_image, found, again, model, True, clock)
     _refuse_turned(upright, model, camera)
-    a = max(decided.agreement, again.agreement, key=lambda agreement: agreement.agree)
+    a = max(decided.agreement, again.agreement, key=lambda agreement: (agreement.tells, agreement.agree))
+    said, figures, hint = _of_codes(a, first, model, camera)
+    refuse_too_fine(upright, model, camera, said, structure=True)
+    raise DecodeError(said + figures, hint=hint)
+
+
+def _of_codes(a: Agreement, found: Found, model: PatternModel, camera: CameraFormat) -> tuple[str, str, str]:
+    """Where stripes and carriers are there and the codes are not those described: what to say, by what figures, a hint.
+
+    A description is contradicted by words that are read clearly. Where hardly any is, nothing is said against it:
+    light, contrast or resolution did not carry the words, and a wrong description is but one of the causes.
+    """
     if a.exchanged:
         words = " and ".join(str(word) for word in a.exchanged)
         said = f"the codes contradict the description: code words {words} stand in one another's places"
-        hint = 'exchange them in the description\'s "codes" if that is what is projected'
-    else:
-        said = (
-            "stripes and carriers are there, but the codes contradict the description "
-            f"(of {a.clear:.0%} clear code words {a.agree:.0%} fit, {a.order:.0%} of neighbours are in order)"
-        )
-        hint = "check bits, carriers, codes and axis of the description against what is projected"
-    refuse_too_fine(upright, model, camera, said, structure=True)
-    raise DecodeError(said, hint=hint)
+        return said, "", 'exchange them in the description\'s "codes" if that is what is projected'
+    if a.tells:
+        figures = f" (of {a.clear:.0%} clear code words {a.agree:.0%} fit, {a.order:.0%} of neighbours are in order)"
+        return "stripes and carriers are there, but the codes contradict the description", figures, CHECK
+    peaks = found.parts()[0]
+    height = float(np.median(peaks.height)) if len(peaks.height) else 0.0
+    figures = (
+        f" ({a.clear:.1%} of the stripes' peaks show a code word clearly, {LEAST_CLEAR:.0%} are needed; stripes are "
+        f"{found.pitch:.1f} px high and {height:.0f} of {camera.max_value} grey levels bright, the finest carrier has "
+        f"a period of {found.pitch / model.pitch / float(model.carriers.max()):.1f} px)"
+    )
+    return UNREAD, figures, f"{MORE_LIGHT}. If none of that helps: {CHECK}"
 
 
 def _learnt(found: Found, decided: Decision, *, upside_down: bool) -> Known:

@@ -23,6 +23,10 @@ Ints = NDArray[np.int32]
 CLEAR = 3.0
 """Logarithm of the odds between two code words above which a peak clearly shows the one."""
 
+LEAST_CLEAR = 0.02
+"""Share of the peaks that must show a word clearly for a description to be judged by them. By chance, with carriers of
+another magnification or none, two in a thousand do and mostly none; two in a hundred of the MOST_ASKED are forty."""
+
 LEAST_RUN = 4
 """Peaks of a run that agree on where they stand in the order: both kinds of stripe twice."""
 
@@ -58,6 +62,11 @@ class Agreement:
     exchanged: tuple[int, ...] = ()
 
     @property
+    def tells(self) -> bool:
+        """Whether enough is clear for the description to be judged by."""
+        return self.clear >= LEAST_CLEAR
+
+    @property
     def holds(self) -> bool:
         """Whether this is the pattern described.
 
@@ -68,7 +77,7 @@ class Agreement:
         them along a third of the image. Words alone do not make a pattern: where something else waves along its lines,
         each shows one, and only their order says that nobody projected them.
         """
-        right = self.clear >= 0.02 and self.agree >= 0.85 and self.hits >= 0.7 and self.order >= LEAST_ORDER
+        right = self.tells and self.agree >= 0.85 and self.hits >= 0.7 and self.order >= LEAST_ORDER
         return right and self.wraps < 0.3 and not self.exchanged
 
 
