@@ -23,13 +23,13 @@ from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel
 from scanner.decode.one_surface import doubt_axis, doubtful_steps
 from scanner.decode.pmp_frames import AxisFrames
 from scanner.decode.pmp_join import join_maps
-from scanner.decode.pmp_kernels import decode_pixels
 from scanner.decode.pmp_light import Light, honest, judge_light, judge_ripple
 from scanner.decode.pmp_plan import plan_axis
 from scanner.decode.pmp_sample import take_sample
+from scanner.decode.pmp_strips import decode_strips
 from scanner.decode.reasons import REASONS
 from scanner.decode.sample_kernels import MIN_PIXELS
-from scanner.decode.strips import in_strips
+from scanner.decode.strips import Shared, begins_of
 from scanner.decode.torn_rows import LEAST_LIT, LEAST_SHARE, PARTS, leave_torn_rows_out
 from scanner.decode.unwrapping import Ladder
 from scanner.patterns import CameraFormat
@@ -197,39 +197,36 @@ def decode_axis(
     t, plan = thresholds, plan_axis(pattern, along, frames.there, ladder)
     pixels, finest, clip, sigmas = camera.width * camera.height, plan.finest, t.clip(camera), t.min_modulation_sigmas
     modulation_limits = t.min_modulation_levels, t.min_modulation_share, sigmas
-    sample, seen = take_sample(frames, plan, pixels, camera.max_value, clip, modulation_limits)
-    sample, least = honest(sample, seen, frames, plan), seen.least
-    judged = sample.judged(plan, least, sigmas, t.phase_floor_cycles)
-    noise = judged.noise
+    sigma, albedo, modulation = (m[: 0 if brief else None] for m in (maps.sigma, maps.albedo, maps.modulation))
+    floors, model, limits = np.empty(len(plan.ratios), np.float32), np.empty(5, np.float32), np.empty(7, np.float32)
     arguments = (
         frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, frames.whole, clip,
-        plan.gains, plan.rungs, plan.ratios, plan.errors2,
-        np.asarray(plan.step_errors2 * judged.steps[:, 1] ** 2, np.float32),
-        np.array([noise.read, noise.per_level, ROUNDING_VARIANCE, sample.prior,
-                  1 / (sample.prior + frames.freedom)], np.float32),
-        plan.scale,
-        np.array([least, sigmas**2, t.max_residual_sigmas**2,
-                  t.max_residual_share**2 + sample.overtone_share2(finest), t.max_remainder_sigmas**2,
-                  1 - t.min_unwrap_probability, t.edge_sigmas], np.float32),
+        plan.gains, plan.rungs, plan.ratios, plan.errors2, floors, model, plan.scale, limits,
         plan.ladder.periodic, finest,
+        maps.position, sigma, maps.confidence, albedo, modulation, maps.reason, begins_of(pixels, threads),
     )  # fmt: skip
-    sigma, albedo, modulation = (m[: 0 if brief else None] for m in (maps.sigma, maps.albedo, maps.modulation))
-    out = (maps.position, sigma, maps.confidence, albedo, modulation, maps.reason)
-
-    def decode(begin: int, end: int) -> NDArray[np.int64]:
-        counts = np.zeros(REASONS, np.int64)
-        decode_pixels(*arguments, begin, end, *out, counts)
-        return counts
-
-    counts = np.sum(in_strips(decode, pixels, threads), axis=0)
-    found = remainders(plan.ladder, judged.steps, judged.pixels)
-    random_px, ripple, light = np.nan, None, Light((), None)
-    if not brief:
-        random_px = plan.per_cycle * judged.phase_sigma(finest)
-        light = judge_light(sample, seen, pattern.frequencies, plan)
-        light = judge_ripple(light, frames, plan, sample, pixels, clip, noise, least, sigmas)
-        if found and judged.pixels >= MIN_PIXELS:
-            ripple = _ripple(found[-1], float(plan.step_errors2[-1]), plan.per_cycle, random_px)
+    with Shared(lambda gate, counts: decode_strips(*arguments, gate, counts), threads, REASONS) as shared:
+        sample, seen = take_sample(frames, plan, pixels, camera.max_value, clip, modulation_limits)
+        sample, least = honest(sample, seen, frames, plan), seen.least
+        judged = sample.judged(plan, least, sigmas, t.phase_floor_cycles)
+        noise = judged.noise
+        floors[:] = plan.step_errors2 * judged.steps[:, 1] ** 2
+        model[:] = noise.read, noise.per_level, ROUNDING_VARIANCE, sample.prior, 1 / (sample.prior + frames.freedom)
+        limits[:] = (
+            least, sigmas**2, t.max_residual_sigmas**2, t.max_residual_share**2 + sample.overtone_share2(finest),
+            t.max_remainder_sigmas**2, 1 - t.min_unwrap_probability, t.edge_sigmas,
+        )  # fmt: skip
+        shared.open()
+        # What a report tells is no business of the pass: others are in it by now.
+        found = remainders(plan.ladder, judged.steps, judged.pixels)
+        random_px, ripple, light = np.nan, None, Light((), None)
+        if not brief:
+            random_px = plan.per_cycle * judged.phase_sigma(finest)
+            light = judge_light(sample, seen, pattern.frequencies, plan)
+            light = judge_ripple(light, frames, plan, sample, pixels, clip, noise, least, sigmas)
+            if found and judged.pixels >= MIN_PIXELS:
+                ripple = _ripple(found[-1], float(plan.step_errors2[-1]), plan.per_cycle, random_px)
+        counts = shared.finish()
     settled = off_surface = 0
     if counts[Reason.UNWRAP_RISK]:
         if steps := doubtful_steps(found):

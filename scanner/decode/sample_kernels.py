@@ -193,28 +193,41 @@ def take_good(
     good: NDArray[np.bool_],
     count: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(K, count) phases of good pixels, and the variances of these, cycles squared. Arguments: as `mark_good` left."""
-    taken, cycles2 = np.empty((gains.size, count), np.float32), np.empty((gains.size, count), np.float32)
+    """(K, count) phases of good pixels, and the variances of these, cycles squared; not to be written into.
+
+    Arguments: as `mark_good` left them.
+    """
+    cycles2 = np.empty(modulations.shape, np.float32)
     for k in range(gains.size):
-        to = 0
         for i in range(good.size):
-            if good[i]:
-                taken[k, to] = phases[k, i]
-                b = modulations[k, i]
-                cycles2[k, to] = ((gains[k] * variance[i]) * _PER_TURN2) / (b * b)
-                to += 1
-    return taken, cycles2
+            cycles2[k, i] = ((gains[k] * variance[i]) * _PER_TURN2) / (modulations[k, i] * modulations[k, i])
+    if count == good.size:
+        return phases, cycles2
+    return _compressed(phases, good, count), _compressed(cycles2, good, count)
+
+
+@kernel
+def _compressed(rows: NDArray[np.float32], good: NDArray[np.bool_], count: int) -> NDArray[np.float32]:
+    """(K, count) of the columns that are good, of (K, n)."""
+    # Without a branch: the next one takes the place of one that is not good, behind the last row as well.
+    taken = np.empty(rows.shape[0] * count + 1, np.float32)
+    for k in range(rows.shape[0]):
+        to = k * count
+        for i in range(good.size):
+            taken[to] = rows[k, i]
+            to += good[i]
+    return taken[:-1].reshape(rows.shape[0], count)
 
 
 @kernel
 def count_lit(modulations: NDArray[np.float32], usable: NDArray[np.bool_], least: np.float32) -> int:
     """How many usable pixels have more than `least` in all sets. modulations: (K, n). usable: (n,)."""
-    count = 0
+    lit, count = usable.copy(), 0
+    for k in range(modulations.shape[0]):
+        for i in range(usable.size):
+            lit[i] &= modulations[k, i] > least
     for i in range(usable.size):
-        lit = usable[i]
-        for k in range(modulations.shape[0]):
-            lit &= modulations[k, i] > least
-        count += lit
+        count += lit[i]
     return count
 
 

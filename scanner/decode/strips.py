@@ -5,10 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, lru_cache
+from threading import Event
 from typing import TypeVar
 
 import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode.gate import ABANDONED, OPEN, new_gate, set_gate
 
 STRIPS = 6
 """Strips of the image for each thread: few enough to cost nothing, enough to even out a thread that is held up."""
@@ -42,6 +47,66 @@ def in_strips(work: Callable[[int, int], _T], pixels: int, threads: int) -> list
     found = share()
     # One that has not begun is not waited for: its strips are done, and those before it may wait for this one.
     return found + [result for other in others if not other.cancel() for result in other.result()]
+
+
+@lru_cache(maxsize=16)
+def begins_of(pixels: int, threads: int) -> NDArray[np.intp]:
+    """(S + 1,) where strips begin, and where the last one ends: long ones first, so that little switching is done, and
+    short ones last, so that threads end together. Not to be written into."""
+    begins, shortest = [0], 4 * MIN_STRIP
+    while begins[-1] < pixels:
+        share = (pixels - begins[-1]) // (2 * threads) if threads > 1 else pixels
+        begins.append(min(begins[-1] + max(-(-share // MIN_STRIP) * MIN_STRIP, shortest), pixels))
+    return np.array(begins, np.intp)
+
+
+class Shared:
+    """Strips that threads take by turns inside a kernel, which all but one enter before it is known what to do.
+
+    A context: it is left when no other thread is at work any more, and if it is left before `open`, none has been.
+    """
+
+    def __init__(self, work: Callable[[NDArray[np.int64], NDArray[np.int64]], bool], threads: int, counts: int) -> None:
+        """work(gate, counts): waits at the gate and takes strips; False if the gate stayed shut too long (see
+        `pmp_strips.decode_strips`). counts: how many numbers it adds to."""
+        self._work, self._gate, self._decided = work, new_gate(), Event()
+        self._counts = np.zeros((threads, counts), np.int64)
+        self._others = [_crew().submit(self._share, n) for n in range(1, threads)]
+
+    def _share(self, n: int) -> None:
+        if not self._work(self._gate, self._counts[n]):
+            self._decided.wait()
+            self._work(self._gate, self._counts[n])
+
+    def open(self) -> None:
+        """What the work needs is there: others begin."""
+        self._decide(OPEN)
+
+    def finish(self) -> NDArray[np.int64]:
+        """Take strips as well, until all is done; sums of counts."""
+        self._share(0)
+        self._join()
+        return np.asarray(self._counts.sum(axis=0))
+
+    def _decide(self, state: int) -> None:
+        set_gate(self._gate, state)
+        self._decided.set()
+
+    def _join(self) -> None:
+        # One that has not begun is not waited for: its strips are done, and those before it may wait for this one.
+        for other in self._others:
+            if not other.cancel():
+                other.result()
+
+    def __enter__(self) -> Shared:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if not self._decided.is_set():
+            self._decide(ABANDONED)
+            self._join()
+        elif not all(other.done() for other in self._others):
+            self._join()
 
 
 @cache
