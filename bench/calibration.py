@@ -35,7 +35,7 @@ from drivers.registry import open_camera, open_projector
 from drivers.simulated.rigs import reference
 from drivers.simulated.rigs import rig as simulated_rig
 from drivers.simulated.targets import wedge_planes, wedge_points
-from scanner.calibration.figure_spread import noise_alone
+from scanner.calibration.figure_spread import SPHERE, noise_alone
 from scanner.calibration.hall import triangulate_hall
 from scanner.calibration.lens_slopes import lens_numbers
 from scanner.calibration.observe import LeftOut, Observation, observe_capture, observe_decoded
@@ -43,7 +43,7 @@ from scanner.calibration.problem import View
 from scanner.calibration.solve import SolveOptions, sigmas, solve
 from scanner.calibration.solve_hall import solve_hall
 from scanner.calibration.targets import parse_target
-from scanner.calibration.verification import measured_sphere, sphere_figures, sphere_points
+from scanner.calibration.verification import measured_sphere, sphere_points
 from scanner.clock import VirtualClock
 from scanner.decode import decoder_for
 from scanner.devices import CameraSettings, TriggerMode
@@ -174,7 +174,7 @@ def spheres(chosen):
             made.xyz[~inside] = np.nan
             on = sphere_points(made.xyz, 2 * radius)
             found = measured_sphere(on, 2 * radius)
-            noise = noise_alone(on, made.sigma_z, sphere_figures, round_=True)["form_mm"]
+            noise = noise_alone(on, made.sigma_z, SPHERE)["form_mm"]
             print(
                 f"{name:11} {found.size_mm / 2:+17.4f} {found.rms_mm:8.4f} {found.shell_mm:9.4f} {found.form_mm:16.4f} "
                 f"{noise:19.4f} {found.points:8}",

@@ -27,16 +27,31 @@ class PointSpread:
     slopes: Array
     covariance: Array
 
-    def draws(self, count: int, seed: int) -> Array:
-        """(count, n, 3) mm by which the points would be moved by other rigs that the covariance allows."""
+    @property
+    def root(self) -> Array:
+        """(k, r): what r numbers of unit variance are multiplied by to be parameters that the covariance allows."""
         sigmas = np.sqrt(np.clip(np.diag(self.covariance), 0, None))
         free = np.flatnonzero(sigmas > 0)
-        # Focal lengths and third coefficients lie powers of ten apart: drawn as shares of their own sigmas.
+        # Focal lengths and third coefficients lie powers of ten apart: taken as shares of their own sigmas.
         correlation = self.covariance[np.ix_(free, free)] / np.outer(sigmas[free], sigmas[free])
         values, vectors = np.linalg.eigh((correlation + correlation.T) / 2)
-        normal = np.random.default_rng(seed).normal(size=(count, len(free)))
-        steps = (normal * np.sqrt(np.clip(values, 0, None))) @ vectors.T * sigmas[free]
-        return np.asarray(np.einsum("nik,dk->dni", self.slopes[..., free], steps), dtype=np.float64)
+        root = np.zeros((len(sigmas), len(free)))
+        root[free] = sigmas[free, None] * vectors * np.sqrt(np.clip(values, 0, None))
+        return root
+
+    def draws(self, count: int, seed: int) -> Array:
+        """(count, n, 3) mm by which the points would be moved by other rigs that the covariance allows.
+
+        Of more rigs than parameters, their own mean and covariance are exactly those meant: fewer of them will do.
+        """
+        root = self.root
+        normal = np.random.default_rng(seed).normal(size=(count, root.shape[1]))
+        if count > 2 * normal.shape[1]:
+            normal -= normal.mean(axis=0)
+            u, _, v = np.linalg.svd(normal, full_matrices=False)
+            normal = np.sqrt(count) * u @ v
+        steps = normal @ root.T
+        return np.asarray(np.einsum("nik,dk->dni", self.slopes, steps), dtype=np.float64)
 
 
 def depth_spread(calibration: Calibration, scan: Scan, axis: str) -> float | None:

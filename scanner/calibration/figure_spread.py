@@ -1,33 +1,47 @@
 """How sure the figures of a verification are: standard uncertainties in the manner of the GUM (JCGM 100:2008).
 
-Of each figure two parts. Calibration: the rig's covariance, propagated by drawing rigs that it allows (JCGM 101:2008)
-and measuring the feature again in the points they would have given. Random: how much the figure changes with the points
-that happen to be used (bootstrap, Efron 1979), as far as their errors are independent. Neither contains what the
-feature itself is uncertain by, nor ripple that a response leaves: of form and flatness that is a part, seen as it is.
+Of each figure two parts. Random: how much the figure changes with the points' own errors, as far as these are
+independent: by order statistics for a width that holds a share of the points, else by the points that happen to be used
+(bootstrap, Efron 1979). Calibration: the rig's covariance, propagated by drawing rigs that it allows (JCGM 101:2008)
+and measuring the feature again in the points they would have given. Neither contains what the feature itself is
+uncertain by, nor ripple that a response leaves: of form and flatness that is a part, seen as it is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from scanner.calibration.detection import Detection
-from scanner.calibration.features import plane_through, sphere_through
+from scanner.calibration.features import plane_through, sphere_through, spread
 from scanner.calibration.targets import Target
-from scanner.calibration.verification import FeaturePoints, local_point, local_weights
+from scanner.calibration.verification import (
+    LEFT_OUT,
+    OF_SHELL,
+    FeaturePoints,
+    board_figures,
+    local_point,
+    local_weights,
+    sphere_figures,
+)
 from scanner.calibration_spread import PointSpread, point_spread
 from scanner.geometry import Array, Calibration
 
 COVERAGE_FACTOR = 2.0
-DRAWS = 200
-"""Of each kind: an uncertainty is good to 5 % by so many"""
+COVERAGE = 0.9545
+"""What two sigmas of a normal error hold"""
+DRAWS = 300
+"""Of each kind: a standard uncertainty is good to 4 % by so many, the half-width that holds COVERAGE of them to 6 %"""
 POINTS = 2000
 """Of a feature that are measured again in each draw: the calibration moves neighbours alike"""
 FEWEST_OF_TARGET = 12
 """Points of a target by which the places of its marks are judged: an affine map takes twelve numbers from 36"""
+LIKELY = 0.95
+"""Of all rigs that a covariance allows: those whose parameters are not farther from the calibration's"""
 _SEED = 2634
 
 Figures = Callable[[Array], Mapping[str, float]]
@@ -36,17 +50,23 @@ Figures = Callable[[Array], Mapping[str, float]]
 
 @dataclass(frozen=True)
 class Spread:
-    """Standard uncertainties of one figure, in its own unit; None: unknown."""
+    """Standard uncertainties of one figure, in its own unit; None: unknown.
+
+    reach: the half-width about the figure that holds COVERAGE of what the calibration makes of it, where that is not
+    two standard uncertainties: calibrations that are off make form grow and never shrink.
+    """
 
     random: float | None
     calibration: float | None
+    reach: float | None = None
 
     @property
     def expanded(self) -> float | None:
         """U, k = 2; None where one of them is unknown."""
         if self.random is None or self.calibration is None:
             return None
-        return COVERAGE_FACTOR * float(np.hypot(self.random, self.calibration))
+        reach = COVERAGE_FACTOR * self.calibration if self.reach is None else self.reach
+        return float(np.hypot(COVERAGE_FACTOR * self.random, reach))
 
     def as_dict(self) -> dict[str, float | None]:
         """For documents."""
@@ -66,26 +86,88 @@ class Rig:
         return point_spread(self.calibration, pixels, xyz, self.axis)
 
 
-def spread_of_figures(on: FeaturePoints, width: int, figures: Figures, rig: Rig | None) -> dict[str, Spread]:
+@dataclass(frozen=True, eq=False)
+class Deviations:
+    """Of points from the feature through them. off: (n,) mm along normals, (n, 3); free: (n, f) what the feature's own
+    place and size would add to `off`."""
+
+    off: Array
+    normals: Array
+    free: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Feature:
+    """How a kind of feature is measured. widths: figures that are the width which holds all but a share of the
+    deviations, with that share."""
+
+    figures: Figures
+    deviations: Callable[[Array], Deviations]
+    widths: Mapping[str, float] = field(default_factory=dict)
+
+
+def _from_plane(points: Array) -> Deviations:
+    centre, normal, axes = plane_through(points)
+    across = (points - centre) @ axes.T
+    free = np.column_stack((np.ones(len(points)), across))
+    return Deviations((points - centre) @ normal, np.broadcast_to(normal, points.shape), free)
+
+
+def _from_sphere(points: Array) -> Deviations:
+    centre, radius = sphere_through(points)
+    away = points - centre
+    length = np.linalg.norm(away, axis=1)
+    normals = away / length[:, None]
+    return Deviations(length - radius, normals, np.column_stack((np.ones(len(points)), normals)))
+
+
+BOARD = Feature(board_figures, _from_plane, {"flatness_mm": LEFT_OUT})
+SPHERE = Feature(sphere_figures, _from_sphere, {"form_mm": LEFT_OUT, "shell_mm": OF_SHELL})
+
+
+def spread_of_figures(on: FeaturePoints, width: int, feature: Feature, rig: Rig | None) -> dict[str, Spread]:
     """Of all figures of a feature, by name.
 
     Args:
-        on: its points. width: of the scan, pixels. figures: how it is measured. rig: None where it is not known.
+        on: its points. width: of the scan, pixels. feature: its kind. rig: None where it is not known.
     """
     generator = np.random.default_rng(_SEED)
     chosen = generator.permutation(len(on.points))[:POINTS]
     points, at = on.points[chosen], on.at[chosen]
     share = np.sqrt(len(points) / len(on.points))
-    again = [figures(points[generator.integers(len(points), size=len(points))]) for _ in range(DRAWS)]
-    names = tuple(again[0])
-    random = {name: float(share * np.std([one[name] for one in again], ddof=1)) for name in names}
+    again = [feature.figures(points[generator.integers(len(points), size=len(points))]) for _ in range(DRAWS)]
+    random = {name: float(share * np.std([one[name] for one in again], ddof=1)) for name in again[0]}
+    off = feature.deviations(on.points).off
+    random |= {name: _of_width(off, left_out) for name, left_out in feature.widths.items()}
     moves = None if rig is None else rig.spread(points, at // width, at % width)
     if moves is None:
-        return {name: Spread(random[name], None) for name in names}
-    as_is, others = figures(points), [figures(points + move) for move in moves.draws(DRAWS, _SEED)]
-    # About the figure as it is: where it can but grow, as form can, its mean over the draws is off, too.
-    off = {name: np.array([one[name] for one in others]) - as_is[name] for name in names}
-    return {name: Spread(random[name], float(np.sqrt(np.mean(off[name] ** 2)))) for name in names}
+        return {name: Spread(random[name], None) for name in random}
+    # What the calibration has done to the form is in the points already: drawn on top of it, it would count twice.
+    points = points - _likely_part(moves, feature.deviations(points))
+    of_rig = _of_rig(points, moves, feature)
+    return {name: Spread(random[name], *of_rig[name]) for name in random}
+
+
+def _of_rig(points: Array, moves: PointSpread, feature: Feature) -> dict[str, tuple[float, float | None]]:
+    """Of each figure what other rigs would make of it, rms, and the half-width that holds COVERAGE of that."""
+    others = [points + move for move in moves.draws(DRAWS, _SEED)]
+    alone, measured = feature.figures(points), [feature.figures(other) for other in others]
+    found: dict[str, tuple[float, float | None]] = {}
+    for name in alone:
+        apart = np.abs([one[name] - alone[name] for one in measured])
+        if name == "tilt_deg" and alone[name] < np.quantile(turned := _turned(points, others), COVERAGE):
+            # The angle of a board that faces the camera but grows, whichever way its normal is off.
+            apart = turned
+        # Two standard deviations hold COVERAGE of what is as often too small, and are better known than its quantile.
+        reach = float(np.quantile(apart, COVERAGE)) if name in (*feature.widths, "rms_mm", "tilt_deg") else None
+        found[name] = float(np.sqrt(np.mean(apart**2))), reach
+    return found
+
+
+def _turned(points: Array, others: list[Array]) -> Array:
+    """Angles by which planes through other points are turned against the one through these, degrees."""
+    normal = plane_through(points)[1]
+    return np.degrees([np.arccos(min(1.0, abs(float(plane_through(one)[1] @ normal)))) for one in others])
 
 
 def spread_of_length(found: Detection, target: Target, xyz: NDArray[np.float32], rig: Rig | None) -> Spread:
@@ -114,26 +196,54 @@ def spread_of_length(found: Detection, target: Target, xyz: NDArray[np.float32],
     return Spread(random, float(np.sqrt(max(float(apart @ covariance @ apart), 0.0))))
 
 
-def noise_alone(on: FeaturePoints, sigma_z: NDArray[np.float32], figures: Figures, *, round_: bool) -> dict[str, float]:
+def noise_alone(on: FeaturePoints, sigma_z: NDArray[np.float32], feature: Feature) -> dict[str, float]:
     """The figures that a perfect feature would have in this scan, by the sigmas of its points alone.
 
     Args:
-        sigma_z: (H, W) mm of the scan. round_: a sphere, else a plane.
+        on: its points. sigma_z: (H, W) mm of the scan. feature: its kind.
     """
-    if round_:
-        centre, radius = sphere_through(on.points)
-        away = on.points - centre
-        normals = away / np.linalg.norm(away, axis=1, keepdims=True)
-        ideal = centre + radius * normals
-    else:
-        centre, normal, _ = plane_through(on.points)
-        normals = np.broadcast_to(normal, on.points.shape)
-        ideal = on.points - ((on.points - centre) @ normal)[:, None] * normal
+    found = feature.deviations(on.points)
+    ideal = on.points - found.off[:, None] * found.normals
     # A point moves along its ray: by as much of that as goes along the normal.
-    across = np.abs((on.points / on.points[:, 2:] * normals).sum(axis=1))
+    across = np.abs((on.points / on.points[:, 2:] * found.normals).sum(axis=1))
     sigma = across * np.nan_to_num(sigma_z.reshape(-1)[on.at].astype(np.float64))
     off = sigma * np.random.default_rng(_SEED).normal(size=len(sigma))
-    return dict(figures(ideal + off[:, None] * normals))
+    return dict(feature.figures(ideal + off[:, None] * found.normals))
+
+
+def _of_width(off: Array, left_out: float) -> float:
+    """1-sigma of the width that holds all but a share p of n independent deviations: sqrt(p (1 - p) / n) |dW / dp|.
+
+    The number of points between two fixed limits is binomial, the width is the least of its kind, so that in first
+    order only that number matters (as for quantiles, David and Nagaraja 2003, sec. 10.2); the slope is the points' own.
+    """
+    step = left_out / 3
+    slope = (spread(off, left_out - step) - spread(off, left_out + step)) / (2 * step)
+    return float(np.sqrt(left_out * (1 - left_out) / len(off)) * slope)
+
+
+def _likely_part(moves: PointSpread, found: Deviations) -> Array:
+    """(n, 3) mm: what the calibration has moved points by, as far as their deviations show it and its covariance lets
+    it be likely.
+
+    Least squares with the covariance as what is known before (Tarantola 2005, sec. 3.2), the feature's place and size
+    left free. A feature that is bent itself may look like a calibration that is off by many sigmas: no more is
+    taken than a likely one.
+    """
+    basis = np.linalg.qr(found.free)[0]
+    root = moves.root
+    modes = np.einsum("nik,ni->nk", moves.slopes, found.normals) @ root
+    modes -= basis @ (basis.T @ modes)
+    left = found.off - basis @ (basis.T @ found.off)
+    noise = float(np.mean(left**2))
+    u, s, v = np.linalg.svd(modes, full_matrices=False)
+    if noise <= 0 or not s.any():
+        return np.zeros((len(left), 3))
+    taken = (s / (s**2 + noise)) * (u.T @ left)
+    seen = float(np.sum(s**2 / (s**2 + noise)))
+    most = float(np.sqrt(chi2.ppf(LIKELY, seen)))
+    taken *= min(1.0, most / max(float(np.linalg.norm(taken)), 1e-30))
+    return np.asarray(np.einsum("nik,k->ni", moves.slopes, root @ (v.T @ taken)), dtype=np.float64)
 
 
 def _scatter_along(found: Detection, target: Target, xyz: NDArray[np.float32], along: Array) -> float | None:

@@ -25,13 +25,14 @@ from scanner.calibration.features import (
     sphere_through,
     spread,
 )
+from scanner.calibration.repeat_spread import half_width
 from scanner.calibration.targets import Target
 from scanner.errors import DecodeError
 
 LEFT_OUT = 0.003
 """Share of points that may be left out (VDI/VDE 2634-2, 2012, sec. 6)."""
 OF_SHELL = 0.05
-"""Share that the shell of `Probing.shell_mm` leaves out (ISO 10360-8:2013, P_Form.Sph.D95%)."""
+"""Share that the shell of `Probing.shell_mm` leaves out (P_Form.Sph.D95% of ISO 10360-8:2013, and of -13:2021)."""
 FEWEST_POINTS = 500
 OTHER_SIZES = 1.2 ** np.arange(-5.0, 6.0)
 """Where there is no sphere of the diameter given, one of so many times that is looked for, each to a tenth: a radius
@@ -45,7 +46,8 @@ ROUND_SHARE = 0.02
 @dataclass(frozen=True)
 class Flatness:
     """A flat board. flatness_mm: the distance between two parallel planes that hold 99.7 % of the points (F of the
-    guideline); rms_mm: from the plane; bow_mm: depth of the best paraboloid over the board's half diagonal."""
+    guideline); rms_mm: from the plane; bow_mm: depth of the best paraboloid over the board's half diagonal,
+    above 0 where the rim is nearer to the camera than the middle."""
 
     flatness_mm: float
     rms_mm: float
@@ -59,8 +61,8 @@ class Flatness:
 @dataclass(frozen=True)
 class Probing:
     """A sphere. form_mm: spread of the radial distances, 99.7 % of the points (PF); shell_mm: the same of 95 % (the
-    dispersion value of ISO 10360-8); size_mm: diameter less the stated one (PS), None where none was stated; rms_mm: of
-    the radial distances."""
+    dispersion of ISO 10360-8 and -13); size_mm: diameter less the stated one (PS), None where none was stated;
+    rms_mm: of the radial distances."""
 
     form_mm: float
     shell_mm: float
@@ -84,9 +86,10 @@ class LengthError:
 @dataclass(frozen=True)
 class Repeatability:
     """The same scene scanned several times. depth_mm: root mean square of the pixels' standard deviations;
-    drift_mm: largest mean offset in depth of a scan from the mean of all."""
+    expanded_mm: its U, None for two scans; drift_mm: largest mean offset in depth of a scan from the mean of all."""
 
     depth_mm: float
+    expanded_mm: float | None
     drift_mm: float
     scans: int
     points: int
@@ -129,6 +132,8 @@ def measured_board(on: FeaturePoints) -> Flatness:
 def board_figures(on: Array) -> dict[str, float]:
     """What `Flatness` says of points (n, 3) of a board, by name."""
     centre, normal, axes = plane_through(on)
+    # Towards the camera: bows of one sign are hollow, whichever way the fit took its normal.
+    normal = normal if normal @ centre < 0 else -normal
     off = (on - centre) @ normal
     across = (on - centre) @ axes.T
     size = float(np.linalg.norm(across, axis=1).max())
@@ -268,6 +273,7 @@ def repeatability(scans: Sequence[NDArray[Any]]) -> Repeatability:
     drift = (values - values.mean(axis=0))[:, kept].mean(axis=1)
     return Repeatability(
         depth_mm=float(np.sqrt(variance[kept].mean())),
+        expanded_mm=half_width(values[:, kept]),
         drift_mm=float(np.abs(drift).max()),
         scans=len(scans),
         points=int(kept.sum()),

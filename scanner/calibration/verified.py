@@ -13,18 +13,25 @@ from typing import Any
 import numpy as np
 
 from scanner.calibration.edges import edge_width
-from scanner.calibration.figure_spread import COVERAGE_FACTOR, Rig, noise_alone, spread_of_figures, spread_of_length
+from scanner.calibration.figure_spread import (
+    BOARD,
+    COVERAGE_FACTOR,
+    SPHERE,
+    Feature,
+    Rig,
+    noise_alone,
+    spread_of_figures,
+    spread_of_length,
+)
 from scanner.calibration.marks import Marks, measured_marks
 from scanner.calibration.targets import Target
 from scanner.calibration.verification import (
     FeaturePoints,
-    board_figures,
     board_points,
     length_between,
     measured_board,
     measured_sphere,
     plain,
-    sphere_figures,
     sphere_points,
     target_ends,
 )
@@ -37,6 +44,9 @@ from scanner.stated_length import stated_length_of
 SAME_PX = 0.05
 """Projector px by which points may miss their coordinates under the scan's own calibration: float32 leaves a
 thousandth. Points of both axes lie between the two: noise, as it is stated, comes on top."""
+
+NOISE_OF = {"flatness_mm": "noise_mm", "form_mm": "noise_mm", "shell_mm": "shell_noise_mm"}
+"""What a figure is called that noise alone would make of a perfect feature"""
 
 
 @dataclass(frozen=True)
@@ -67,12 +77,12 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
     rig, why = rig_of(folder, scan, given)
     if wanted.flat:
         board = board_points(scan.xyz)
-        found["flat"] = plain(measured_board(board)) | _of_noise(board, scan, "flatness_mm")
-        found["flat"]["uncertainty"] = _spreads(spread_of_figures(board, scan.shape[1], board_figures, rig))
+        found["flat"] = plain(measured_board(board)) | _of_noise(board, scan, BOARD)
+        found["flat"]["uncertainty"] = _spreads(spread_of_figures(board, scan.shape[1], BOARD, rig))
     if wanted.sphere_mm is not None:
         ball = sphere_points(scan.xyz, wanted.sphere_mm)
-        spreads = _spreads(spread_of_figures(ball, scan.shape[1], sphere_figures, rig))
-        found["sphere"] = plain(measured_sphere(ball, wanted.sphere_mm)) | _of_noise(ball, scan, "form_mm")
+        spreads = _spreads(spread_of_figures(ball, scan.shape[1], SPHERE, rig))
+        found["sphere"] = plain(measured_sphere(ball, wanted.sphere_mm)) | _of_noise(ball, scan, SPHERE)
         found["sphere"]["uncertainty"] = {**spreads, "size_mm": spreads["diameter_mm"]}
     if wanted.target is not None:
         seen, ends = target_ends(scan.albedo, scan.xyz, wanted.target)
@@ -137,12 +147,10 @@ def _made_by(rig: Rig, scan: Scan) -> bool:
     return bool(np.median(np.abs(seen - values.reshape(-1)[at])) < SAME_PX + noise)
 
 
-def _of_noise(on: FeaturePoints, scan: Scan, name: str) -> dict[str, Any]:
-    """The figure of a perfect feature in this noise, where the scan has sigmas."""
-    if scan.sigma_z is None:
-        return {"noise_mm": None}
-    figures = board_figures if name == "flatness_mm" else sphere_figures
-    return {"noise_mm": noise_alone(on, scan.sigma_z, figures, round_=name == "form_mm")[name]}
+def _of_noise(on: FeaturePoints, scan: Scan, feature: Feature) -> dict[str, Any]:
+    """Its widths, of a perfect feature in this noise, where the scan has sigmas."""
+    alone = None if scan.sigma_z is None else noise_alone(on, scan.sigma_z, feature)
+    return {NOISE_OF[name]: None if alone is None else alone[name] for name in feature.widths}
 
 
 def _of_stated(found: dict[str, Any], rig: Rig) -> dict[str, float] | None:

@@ -60,8 +60,8 @@ def verify(
     """Measure known features in scans, in the words of VDI/VDE 2634 part 2. All lengths are mm.
 
     Figures of a board, a sphere, a length have an expanded uncertainty (+-, k = 2): of the calibration, by its
-    covariance, and of the points used; --repeat's deviation has one of the number of scans. Without one: noise, which
-    is an expectation; --edge; --marks, which say what is allowed; --repeat's drift.
+    covariance, and of the points used; --repeat's deviation has one from three scans on. Without one: noise, which is
+    an expectation; --edge; --marks, which say what is allowed; --repeat's drift.
 
     \b
     Examples:
@@ -247,12 +247,10 @@ def _cells_of(kind: str, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _with_spread(found: dict[str, Any]) -> dict[str, Any]:
-    """A repeatability with the uncertainty of its standard deviation: s / sqrt(2 (n - 1)) of n scans (JCGM 100, E.4.3).
-
-    That is of one pixel. What makes scans differ (light, warmth) is common to pixels: their number makes it no surer.
-    """
-    sigma = found["depth_mm"] / (2 * (found["scans"] - 1)) ** 0.5
-    return {**found, "uncertainty": {"depth_mm": {"random": sigma, "expanded": 2 * sigma}}}
+    """A repeatability with its uncertainty where the others have theirs."""
+    expanded = found.pop("expanded_mm")
+    standard = None if expanded is None else expanded / 2
+    return {**found, "uncertainty": {"depth_mm": {"random": standard, "expanded": expanded}}}
 
 
 def _besides(budget: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any] | None:
@@ -274,6 +272,35 @@ def _besides(budget: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]
     }
 
 
+WIDTHS = (
+    ("flat", "flatness_mm", "noise_mm", "flatness F", "VDI/VDE 2634-2, 99.7 % of the points"),
+    ("sphere", "form_mm", "noise_mm", "probing form PF", "VDI/VDE 2634-2, 99.7 % of the points"),
+    ("sphere", "shell_mm", "shell_noise_mm", "form dispersion", "ISO 10360-13, 95 % of the points"),
+)
+"""Figures that norms define: kind, name, what noise alone makes of it, in words, and which norm"""
+
+
+def _of_widths(one: dict[str, Any]) -> list[tuple[str, str]]:
+    """Lines of what norms define, in their words, each with what of it is noise."""
+    lines = []
+    for kind, name, of_noise, called, norm in WIDTHS:
+        if kind not in one:
+            continue
+        width, noise = one[kind][name], one[kind][of_noise]
+        shown = with_uncertainty(width, one[kind]["uncertainty"][name]["expanded"])
+        by = "what noise makes of it is not known" if noise is None else _beyond(width, noise, kind)
+        lines.append((called, f"{shown} mm, {norm}; {by}: {one['scan']}"))
+    return lines
+
+
+def _beyond(width: float, noise: float, kind: str) -> str:
+    """What a width has beyond that of noise, in quadrature, as normal deviations add up."""
+    feature = "board" if kind == "flat" else "sphere"
+    beyond = math.sqrt(max(width**2 - noise**2, 0.0))
+    rest = f"beyond it {rounded(beyond)}" if beyond > 0 else "nothing beyond it"
+    return f"a perfect {feature} has {rounded(noise)} by the points' noise, {rest}"
+
+
 def _show(document: dict[str, Any]) -> None:
     for kind in ("flat", "sphere", "length", "edge", "marks"):
         rows = [(one["scan"], _cells_of(kind, one[kind])) for one in document["scans"] if kind in one]
@@ -285,7 +312,8 @@ def _show(document: dict[str, Any]) -> None:
     for one in document["scans"]:
         if (said := one.get("marks", {}).get("warning")) is not None:
             print_error(f"{one['scan']}: {said}", label="warning")
-    facts = _of_repeats(document.get("repeatability"))
+    facts = [line for one in document["scans"] for line in _of_widths(one)]
+    facts += _of_repeats(document.get("repeatability"))
     facts.append(("largest error", f"{document['largest_error_mm']:.4f} mm, as measured"))
     for one in document["scans"]:
         if "coverage_factor" in one:
@@ -302,7 +330,9 @@ def _of_repeats(found: dict[str, Any] | None) -> list[tuple[str, str]]:
     if found is None:
         return []
     shown = with_uncertainty(found["depth_mm"], found["uncertainty"]["depth_mm"]["expanded"])
-    of = f"standard deviation of {found['scans']} scans (k = 2, by their number), rms over {found['points']:,} pixels"
+    of = f"standard deviation of {found['scans']} scans (k = 2), rms over {found['points']:,} pixels"
+    if found["uncertainty"]["depth_mm"]["expanded"] is None:
+        of += "; from three scans on they say whether noise or a change makes it"
     return [("depth mm", f"{shown}: {of}"), ("drift mm", f"{rounded(found['drift_mm'])}, of the farthest scan's mean")]
 
 

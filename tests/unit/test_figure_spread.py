@@ -12,7 +12,9 @@ import pytest
 
 from scanner.calibration import figure_spread
 from scanner.calibration.detection import Detection
-from scanner.calibration.figure_spread import Rig, noise_alone, spread_of_figures, spread_of_length
+from scanner.calibration.features import spread
+from scanner.calibration.figure_spread import BOARD, SPHERE, Rig, noise_alone, spread_of_figures, spread_of_length
+from scanner.calibration.repeat_spread import half_width
 from scanner.calibration.targets import parse_target
 from scanner.calibration.verification import FeaturePoints, board_figures, board_points, sphere_figures
 from scanner.capture import CaptureHeader
@@ -68,11 +70,12 @@ def wall(seed=0):
 @pytest.fixture(autouse=True)
 def _fewer_draws(monkeypatch):
     monkeypatch.setattr(figure_spread, "DRAWS", 100)
+    monkeypatch.setattr(figure_spread, "POINTS", 800)
 
 
 def test_a_baseline_too_long_makes_a_ball_too_large_and_no_less_round():
-    found = spread_of_figures(ball_alone(0), WIDTH, sphere_figures, Rig(calibration_from_dict(rig()), "y"))
-    assert found["diameter_mm"].calibration == pytest.approx(SHARE * 2 * RADIUS, rel=0.2)
+    found = spread_of_figures(ball_alone(0), WIDTH, SPHERE, Rig(calibration_from_dict(rig()), "y"))
+    assert found["diameter_mm"].calibration == pytest.approx(SHARE * 2 * RADIUS, rel=0.03)
     assert found["form_mm"].calibration < 2 * SHARE * 6 * NOISE_MM
     both = np.hypot(found["diameter_mm"].random, found["diameter_mm"].calibration)
     assert found["diameter_mm"].expanded == pytest.approx(2 * both)
@@ -87,7 +90,7 @@ def ball_alone(seed):
 
 def test_the_random_part_is_what_other_noise_makes_of_it():
     clouds = [ball_alone(seed) for seed in range(12)]
-    stated = spread_of_figures(clouds[0], WIDTH, sphere_figures, None)
+    stated = spread_of_figures(clouds[0], WIDTH, SPHERE, None)
     for name in ("diameter_mm", "form_mm"):
         seen = np.std([sphere_figures(on.points)[name] for on in clouds], ddof=1)
         # A deviation from twelve is good to 21 %, the stated one to 7 %: 2.5 sigma of both.
@@ -96,13 +99,96 @@ def test_the_random_part_is_what_other_noise_makes_of_it():
         assert stated[name].expanded is None
 
 
+def bending_rig():
+    """The rig of `rig`, whose lenses' first coefficients are known to 0.004 only: a wall bends."""
+    names, shares = ["camera.k1", "projector.k1", "translation.y"], [0.004, 0.004, SHARE * BASELINE]
+    return calibration_from_dict(rig(covariance={"parameters": names, "matrix": np.diag(np.square(shares)).tolist()}))
+
+
+def covered(feature, truth, at, names, bow_mm=0.0, draws=30):
+    """Of each figure the share of draws, of rigs and noise, whose U contains what the true rig shows."""
+    of_rig, generator = Rig(bending_rig(), "y"), np.random.default_rng(11)
+    moves = of_rig.spread(truth, at // WIDTH, at % WIDTH).draws(draws, 7)
+    along = truth / truth[:, 2:]
+    away = ((truth - truth.mean(axis=0)) ** 2).sum(axis=1)
+    shape = truth + along * (bow_mm * away / away.max())[:, None]
+
+    def seen():
+        return shape + along * generator.normal(0, NOISE_MM, len(shape))[:, None]
+
+    true = [feature.figures(seen()) for _ in range(20)]
+    inside = dict.fromkeys(names, 0.0)
+    for move in moves:
+        cloud = seen() + move
+        found = feature.figures(cloud)
+        stated = spread_of_figures(FeaturePoints(cloud, at, 1.0), WIDTH, feature, of_rig)
+        for name in names:
+            wanted = np.mean([one[name] for one in true])
+            inside[name] += (abs(found[name] - wanted) < stated[name].expanded) / draws
+    return inside
+
+
+@pytest.mark.parametrize("bow_mm", [0.0, 0.4])
+def test_as_many_boards_as_u_says_are_within_it(monkeypatch, bow_mm):
+    """A calibration that is off makes a board less flat, never flatter: twice its own deviation would be too wide."""
+    monkeypatch.setattr(figure_spread, "DRAWS", 60)  # good to 12 %
+    at = np.flatnonzero(np.ones(WIDTH * HEIGHT))[::29]
+    inside = covered(BOARD, rays().reshape(-1, 3)[at] * 500, at, ("flatness_mm", "distance_mm", "bow_mm"), bow_mm)
+    # Of thirty draws, with 95.45 % each: one in a thousand has fewer than 25 within.
+    assert min(inside.values()) >= 0.83, inside
+
+
+def test_u_of_flatness_is_what_calibrations_scatter_it_by():
+    at = np.flatnonzero(np.ones(WIDTH * HEIGHT))[::17]
+    of_rig, truth = Rig(bending_rig(), "y"), rays().reshape(-1, 3)[at] * 500
+    moves = of_rig.spread(truth, at // WIDTH, at % WIDTH).draws(300, 7)
+    generator, along = np.random.default_rng(12), truth / truth[:, 2:]
+
+    def noisy(points):
+        return points + along * generator.normal(0, NOISE_MM, len(at))[:, None]
+
+    clouds = [noisy(truth + move) for move in moves]
+    flat = np.mean([board_figures(noisy(truth))["flatness_mm"] for _ in range(20)])
+    seen = np.quantile([abs(board_figures(one)["flatness_mm"] - flat) for one in clouds], 0.9545)
+    on = [FeaturePoints(one, at, 1.0) for one in clouds[:6]]
+    stated = [spread_of_figures(one, WIDTH, BOARD, of_rig)["flatness_mm"].expanded for one in on]
+    # Both quantiles are good to 7 %.
+    assert np.median(stated) == pytest.approx(seen, rel=0.2)
+
+
+def test_width_of_points_is_as_sure_as_order_statistics_have_it():
+    generator = np.random.default_rng(13)
+    normals = [generator.normal(size=4000) for _ in range(150)]
+    for left_out in (0.003, 0.05):
+        seen = np.std([spread(one, left_out) for one in normals], ddof=1)
+        stated = [figure_spread._of_width(one, left_out) for one in normals[:20]]
+        # 150 give a deviation good to 6 %, the slope by differences is a few per cent too steep.
+        assert np.mean(stated) == pytest.approx(seen, rel=0.2)
+
+
+@pytest.mark.parametrize(("scans", "common"), [(3, 0.0), (6, 0.0), (6, 10.0), (20, 1.0)])
+def test_repeatability_is_as_sure_as_its_pixels_or_its_scans(scans, common):
+    generator = np.random.default_rng(14)
+    noise = np.exp(generator.normal(0, 0.4, 1500))
+    true, inside, widths = np.sqrt(np.mean(noise**2) + common**2), 0, []
+    for _ in range(60):
+        values = noise * generator.normal(size=(scans, 1500)) + common * generator.normal(size=(scans, 1))
+        deviation = np.sqrt(values.var(axis=0, ddof=1).mean())
+        widths.append(half_width(values))
+        inside += abs(deviation - true) < widths[-1]
+    # Of sixty, with 95 % each: two in a thousand have fewer than 52 within.
+    assert inside >= 52
+    # Pixels' own noise: known by all of them; what is common: by the number of scans.
+    assert np.median(widths) / true < 0.05 if common == 0 else np.median(widths) / true > 0.1
+    assert half_width(np.ones((2, 1500))) is None
+    assert half_width(np.ones((4, 1500))) == 0.0
+
+
 def test_form_and_flatness_of_what_is_perfect_are_those_of_its_noise():
     on, sigma = ball_alone(0), ball()[1]
-    assert noise_alone(on, sigma, sphere_figures, round_=True)["form_mm"] == pytest.approx(
-        sphere_figures(on.points)["form_mm"], rel=0.1
-    )
+    assert noise_alone(on, sigma, SPHERE)["form_mm"] == pytest.approx(sphere_figures(on.points)["form_mm"], rel=0.1)
     on = board_points(wall())
-    assert noise_alone(on, sigma, board_figures, round_=False)["flatness_mm"] == pytest.approx(5.94 * NOISE_MM, rel=0.1)
+    assert noise_alone(on, sigma, BOARD)["flatness_mm"] == pytest.approx(5.94 * NOISE_MM, rel=0.1)
 
 
 def test_length_of_a_target_is_as_sure_as_the_baseline_and_the_places_of_its_marks():
@@ -163,6 +249,12 @@ def test_verify_takes_the_calibration_that_made_the_scan_and_no_other(tmp_path, 
     said, noted = capsys.readouterr()
     assert "note: the stated length 100.00 +- 0.20 mm (k = 2) dominates, with " in noted
     assert re.search(r"\b0\.\d\d \+- 0\.2\d\b", said), "value and U end at one place"
+    assert re.search(
+        r"probing form PF +0\.\d+ \+- 0\.\d+ mm, VDI/VDE 2634-2, 99.7 % of the points; a perfect sphere", said
+    )
+    assert re.search(
+        r"form dispersion +0\.\d+ \+- 0\.\d+ mm, ISO 10360-13, 95 % of the points; a perfect sphere has", said
+    )
     # U contains the calibration: only the others are said to be in none of the figures.
     assert "+-0.032 mm of depth (k = 2) besides the calibration, in none of these figures; unknown: sync" in said
     save(tmp_path / "b", *ball(), "another")
