@@ -29,8 +29,17 @@ def middles_of_bins(
         (bins,) float32 median of each bin's keys. (bins,) float32 median of its values. (n,) int32, all in the order of
         their keys; equal ones keep theirs. Of an even count the medians are the upper of both in the middle.
     """
-    count = keys.size // bins
     order = order_of(keys)
+    x, y = middles_in_order(order, keys, values, bins, squares)
+    return x, y, order
+
+
+@kernel
+def middles_in_order(
+    order: NDArray[np.int32], keys: NDArray[np.float32], values: NDArray[np.float32], bins: int, squares: bool
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """`middles_of_bins` of those that `order` names, bins or more of them, in the order of their keys."""
+    count = order.size // bins
     x, y, part = np.empty(bins, np.float32), np.empty(bins, np.float32), np.empty(count, np.float32)
     for b in range(bins):
         first = b * count
@@ -38,7 +47,7 @@ def middles_of_bins(
             part[i] = values[order[first + i]]
         x[b] = keys[order[first + count // 2]]
         y[b] = middle_of_squares(part) if squares else nth_of(part, count // 2)
-    return x, y, order
+    return x, y
 
 
 @kernel

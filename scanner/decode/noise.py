@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.middles import middles_of_bins
+from scanner.decode.middles import middles_in_order, middles_of_bins
 from scanner.kernel import kernel
 
 ROUNDING_VARIANCE = 1 / 12
@@ -25,6 +25,12 @@ DEFAULT_READ_SHARE = 0.004
 
 FEWEST = 100
 """Samples without which nothing is said of a camera's noise."""
+
+CUT_SIGMAS = 2.5
+"""Mean over 1-sigma, both as seen, from which on a pixel's noise is whole. Normal noise of mean m and sigma s, cut off
+at 0, has the mean s (d P + p) and the variance s^2 ((d^2 + 1) P + d p - (d P + p)^2), where d = m / s, and P and p are
+the normal distribution and its density at d (Tobin 1958). Their ratio grows with d, .68 at 0 and 2.52 at 2.5, where a
+hundredth of the variance is lost: half of what the model is good to. Below, it is lost fast: a quarter at d = 1."""
 
 _LEVELS = 12
 
@@ -57,6 +63,9 @@ def fit_noise(level: NDArray[np.float32], squares: NDArray[np.float32], freedom:
 
     Medians in bins of equal count stand against pixels that moved or are mixed; the median of a chi-square variable of
     k degrees is k (1 - 2 / (9 k))^3 (Wilson and Hilferty 1931). Under 100 samples, or no freedom, give the default.
+
+    Grey levels end at 0, and noise of pixels as dark as it is high is cut off there: those say nothing of it, and are
+    left out where there are others (see CUT_SIGMAS).
     """
     if freedom < 1 or level.size < FEWEST:
         return default_noise(max_value)
@@ -67,8 +76,19 @@ def fit_noise(level: NDArray[np.float32], squares: NDArray[np.float32], freedom:
 def fit_line(level: NDArray[np.float32], squares: NDArray[np.float32], freedom: int) -> tuple[float, float]:
     """Variance at level 0, and per level, of FEWEST or more samples: see `fit_noise`."""
     # As many in each bin: up to eleven of the brightest are left out.
-    x, medians, _ = middles_of_bins(level, squares, _LEVELS, True)
-    y = medians / (freedom * (1 - 2 / (9 * freedom)) ** 3)
+    per_freedom = freedom * (1 - 2 / (9 * freedom)) ** 3
+    x, medians, order = middles_of_bins(level, squares, _LEVELS, True)
+    y = medians / per_freedom
+    first = 0
+    while first < _LEVELS and x[first] < CUT_SIGMAS * np.sqrt(max(y[first], ROUNDING_VARIANCE)):
+        first += 1
+    if 0 < first < _LEVELS:
+        above, dark = CUT_SIGMAS * np.sqrt(max(y[first], ROUNDING_VARIANCE)), 0
+        while dark < order.size and level[order[dark]] < above:
+            dark += 1
+        if order.size - dark >= FEWEST:
+            x, medians = middles_in_order(order[dark:], level, squares, _LEVELS, True)
+            y = medians / per_freedom
     # A variance's own error grows with it: weights 1 / y, one round of which is enough for two parameters.
     w = 1 / np.maximum(y, ROUNDING_VARIANCE)
     slope, read = 0.0, float(np.median(y))

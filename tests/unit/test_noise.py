@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
-from scanner.decode.noise import ROUNDING_VARIANCE, default_noise, fit_noise
+from scanner.decode.noise import CUT_SIGMAS, ROUNDING_VARIANCE, default_noise, fit_noise
 
 
 def residuals(read, per_level, freedom, count=30_000, seed=2):
@@ -60,3 +61,41 @@ def test_little_evidence_leaves_the_default(count, freedom):
 
 def test_the_default_scales_with_the_range():
     assert default_noise(4095).read == pytest.approx(default_noise(255).read * (4095 / 255) ** 2)
+
+
+def clipped(level, read, per_level, shifts, seed=4):
+    """(mean, sum of squared residuals) of whole grey levels that end at 0, under fringes of a fifth of the level."""
+    random = np.random.default_rng(seed)
+    alpha = 2 * np.pi * np.arange(shifts) / shifts
+    light = level[:, None] * (1 + 0.2 * np.cos(alpha + random.uniform(0, 2 * np.pi, (level.size, 1))))
+    seen = np.maximum(np.rint(light + random.normal(size=light.shape) * np.sqrt(read + per_level * light)), 0)
+    design = np.stack([np.ones(shifts), np.cos(alpha), np.sin(alpha)], axis=1)
+    left = seen - seen @ design @ np.linalg.inv(design.T @ design) @ design.T
+    return seen.mean(axis=1).astype(np.float32), (left**2).sum(axis=1).astype(np.float32)
+
+
+@pytest.mark.parametrize("shifts", [4, 8])
+@pytest.mark.parametrize("dark", [0.3, 0.9])
+def test_noise_that_black_cuts_off_is_not_taken_for_little_noise(shifts, dark):
+    """A dark room around what is measured: sigmas there, and of dark surfaces, came out too small."""
+    random = np.random.default_rng(0)
+    level = np.where(np.arange(40_000) < 40_000 * dark, 0.2, random.uniform(4, 60, 40_000))
+    model = fit_noise(*clipped(level, 0.64, 0.017, shifts), shifts - 3, 255)
+    at = np.array([0, 5, 50], np.float32)
+    assert np.allclose(model.variance(at), 0.64 + 1 / 12 + 0.017 * at, rtol=0.15)
+
+
+def test_an_image_that_is_all_black_says_what_it_can():
+    model = fit_noise(*clipped(np.full(4000, 0.3), 0.64, 0.017, 8), 5, 255)
+    assert model.measured
+    assert ROUNDING_VARIANCE <= model.read < 0.5
+
+
+def test_above_the_limit_a_hundredth_of_the_variance_is_lost_below_it_more():
+    d = np.linspace(-2, 5, 141)
+    mean = d * ndtr(d) + np.exp(-(d**2) / 2) / np.sqrt(2 * np.pi)
+    variance = mean * d + ndtr(d) - mean**2
+    seen = mean / np.sqrt(variance)
+    assert (np.diff(seen) > 0).all()
+    assert np.interp(CUT_SIGMAS, seen, variance) == pytest.approx(0.99, abs=0.003)
+    assert np.interp(CUT_SIGMAS / 2, seen, variance) < 0.8
