@@ -215,7 +215,7 @@ def _of_width(off: Array, left_out: float) -> float:
     """1-sigma of the width that holds all but a share p of n independent deviations: sqrt(p (1 - p) / n) |dW / dp|.
 
     The number of points between two fixed limits is binomial, the width is the least of its kind, so that in first
-    order only that number matters (as for quantiles, David and Nagaraja 2003, sec. 10.2); the slope is the points' own.
+    order only that number matters (as for quantiles, David and Nagaraja 2003, ch. 10); the slope is the points' own.
     """
     step = left_out / 3
     slope = (spread(off, left_out - step) - spread(off, left_out + step)) / (2 * step)
@@ -226,7 +226,7 @@ def _likely_part(moves: PointSpread, found: Deviations) -> Array:
     """(n, 3) mm: what the calibration has moved points by, as far as their deviations show it and its covariance lets
     it be likely.
 
-    Least squares with the covariance as what is known before (Tarantola 2005, sec. 3.2), the feature's place and size
+    Least squares with the covariance as what is known before (Tarantola 2005, ch. 3), the feature's place and size
     left free. A feature that is bent itself may look like a calibration that is off by many sigmas: no more is
     taken than a likely one.
     """

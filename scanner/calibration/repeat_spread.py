@@ -20,6 +20,8 @@ CHANCE = 0.1
 sure than they are. Common parts that are missed would make scans surer than they are."""
 FEWEST = 3
 """Two scans have one difference: whether noise or a change made it, nothing tells"""
+AT_ONCE = 100_000
+"""Pixels: twenty scans of a large camera are a gigabyte"""
 
 
 def half_width(values: Array) -> float | None:
@@ -39,16 +41,19 @@ def half_width(values: Array) -> float | None:
     if scans < FEWEST:
         return None
     freedom = scans - 1
-    off = values - values.mean(axis=0)
-    products = off @ off.T
+    products, fourth = np.zeros((scans, scans)), 0.0
+    for first in range(0, pixels, AT_ONCE):
+        part = values[:, first : first + AT_ONCE]
+        off = part - part.mean(axis=0)
+        products += off @ off.T
+        fourth += float(np.sum((np.einsum("np,np->p", off, off) / freedom) ** 2))
     total = float(np.trace(products)) / freedom
     if total <= 0:
         return 0.0
     squared = freedom * float(np.sum(products**2)) - (freedom * total) ** 2
     squared = max(squared / (freedom * (freedom - 1) * (freedom + 2)), 0.0)
-    each = np.einsum("np,np->p", off, off) / freedom
     # Pixels' variances differ: noise alone has the sum of their squares, which chi-square makes larger by 2 / (n - 1).
-    of_noise = float(np.sum(each**2)) / (1 + 2 / freedom)
+    of_noise = fourth / (1 + 2 / freedom)
     # A symmetric matrix of this size has so many numbers beside its trace.
     numbers = (freedom - 1) * (freedom + 2) / 2
     told = squared > of_noise * float(chi2.ppf(1 - CHANCE, numbers)) / numbers
