@@ -1,9 +1,9 @@
 """How noisy the phases of a scan really are: how well neighbouring rungs of the ladder agree over the image.
 
 What is left of each unwrapping step, the remainder, would be zero everywhere but for phase errors. How much it differs
-between pixels side by side is noise, and gives a noise model to captures whose fits leave no residual (three shifts).
-What its spread has beyond that is systematic: response, interreflection, blur. Whether frames stand in their right
-order is not judged here: `scanner.sequencer` does that, before anything is decoded.
+between pixels side by side is noise (`pair_noise`). What its spread has beyond noise is systematic: response,
+interreflection, blur. Whether frames stand in their right order is not judged here: `scanner.sequencer` does that,
+before anything is decoded.
 """
 
 from __future__ import annotations
@@ -17,24 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from scanner.decode.noise import NoiseModel, default_noise, fit_noise
+from scanner.decode.pair_noise import UNFOLDED_SIGMA
 from scanner.decode.sample_kernels import MIN_PIXELS
 from scanner.decode.unwrapping import Ladder
 
 MIN_AGREEMENT = 0.3
 """Mean cosine of remainders: chance gives 0, noise of a fifth of a fringe .45."""
 
-PAIR_DISTANCE = 2
-"""Camera pixels between the two of a pair: near enough to share what is systematic, too far to share a blur's noise."""
-
 MOST_SYSTEMATIC = 0.1
 """Of a fringe, sigma over the image, by which neighbouring rungs may differ beyond noise before it is said: half a
 fringe, from which on the next one is counted, is then five sigmas away, and such errors have longer tails than noise"""
-
-_UNFOLDED_SIGMA = 0.15
-"""Predicted sigma of a pair's difference, cycles, up to which it stays within half a cycle (3.3 sigma)."""
-_ROUNDS = 3
-"""Of choosing such pairs by the noise model and fitting it to them; the first choice is by the default model."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +90,7 @@ def disagreements(axis: str, remainders: Sequence[Remainder]) -> tuple[str, ...]
         f"frequencies {r.low:g} and {r.high:g} along {axis} do not agree anywhere: are the frames in their order, and "
         f'"sign" and "shifts" of the pattern right?'
         for r in remainders
-        if r.pixels >= MIN_PIXELS and r.expected_sigma < _UNFOLDED_SIGMA and r.agreement < MIN_AGREEMENT
+        if r.pixels >= MIN_PIXELS and r.expected_sigma < UNFOLDED_SIGMA and r.agreement < MIN_AGREEMENT
     )
 
 
@@ -115,41 +107,6 @@ def doubtful_counts(axis: str, remainders: Sequence[Remainder]) -> tuple[str, ..
         for r, beyond in ((r, r.beyond_noise) for r in remainders)
         if beyond > MOST_SYSTEMATIC and r.agreement >= MIN_AGREEMENT
     )
-
-
-def noise_of_pairs(
-    ladder: Ladder,
-    phases: NDArray[np.float32],
-    per_variance: NDArray[np.float32],
-    level: NDArray[np.float32],
-    centre: float,
-    max_value: int,
-) -> NoiseModel:
-    """The noise model under which remainders differ between pixels side by side as much as they do.
-
-    Args:
-        phases: (2, K, n) cycles, of pairs of usable pixels. per_variance: (2, K, n) variance of each over the variance
-            of one sample. level: (n,) mean grey level of a pair. centre: the field's centre, fraction of it.
-        max_value: largest grey level of the camera.
-
-    Returns:
-        The camera's default where there are too few pairs, or only one rung.
-    """
-    model = default_noise(max_value)
-    if len(ladder.errors) == 0:
-        return model
-    both = [np.stack(remainders_of(ladder, of_one, centre)) for of_one in phases]
-    difference = both[0] - both[1]
-    difference -= np.rint(difference)
-    per_sample = (ladder.errors**2) @ (per_variance[0] + per_variance[1])
-    levels = np.broadcast_to(level, difference.shape)
-    for _ in range(_ROUNDS):
-        use = per_sample * model.variance(level) < _UNFOLDED_SIGMA**2
-        if np.count_nonzero(use) < MIN_PIXELS:
-            return model
-        squares = (difference[use] ** 2 / per_sample[use]).astype(np.float32)
-        model = fit_noise(levels[use], squares, 1, max_value)
-    return model
 
 
 @cache

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.middles import middles_in_order, middles_of_bins
+from scanner.decode.middles import middles_in_order, order_of
 from scanner.kernel import kernel
 
 ROUNDING_VARIANCE = 1 / 12
@@ -75,9 +75,17 @@ def fit_noise(level: NDArray[np.float32], squares: NDArray[np.float32], freedom:
 @kernel
 def fit_line(level: NDArray[np.float32], squares: NDArray[np.float32], freedom: int) -> tuple[float, float]:
     """Variance at level 0, and per level, of FEWEST or more samples: see `fit_noise`."""
+    return fit_line_in_order(order_of(level), level, squares, freedom)
+
+
+@kernel
+def fit_line_in_order(
+    order: NDArray[np.int32], level: NDArray[np.float32], squares: NDArray[np.float32], freedom: int
+) -> tuple[float, float]:
+    """`fit_line` of those that `order` names, in the order of their levels."""
     # As many in each bin: up to eleven of the brightest are left out.
     per_freedom = freedom * (1 - 2 / (9 * freedom)) ** 3
-    x, medians, order = middles_of_bins(level, squares, _LEVELS, True)
+    x, medians = middles_in_order(order, level, squares, _LEVELS, True)
     y = medians / per_freedom
     first = 0
     while first < _LEVELS and x[first] < CUT_SIGMAS * np.sqrt(max(y[first], ROUNDING_VARIANCE)):

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode import Coordinates, Decoded, Reason, addresses, neighbours, one_surface, spectra
+from scanner.decode import Coordinates, Decoded, Reason, addresses, neighbours, one_surface, pair_noise, spectra
 from scanner.decode.agreement import disagreements, doubtful_counts
 from scanner.decode.doubled import doubled_frames
 from scanner.decode.frames import FrameCheck
@@ -244,4 +244,5 @@ def warm_up() -> None:
     addresses.warm_up()
     neighbours.warm_up()
     one_surface.warm_up()
+    pair_noise.warm_up()
     spectra.warm_up()

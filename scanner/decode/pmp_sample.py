@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.agreement import PAIR_DISTANCE, folded_medians, noise_of_pairs
+from scanner.decode.agreement import folded_medians
 from scanner.decode.harmonics import SetSpectrum, SpectraSums
 from scanner.decode.middles import nth_of
 from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel, default_noise
+from scanner.decode.pair_noise import noise_of_pairs
 from scanner.decode.pmp_frames import AxisFrames
 from scanner.decode.pmp_plan import AxisPlan
 from scanner.decode.pmp_sums import fit_runs
@@ -77,7 +78,10 @@ class Sample:
                 sigma of a set's phase, cycles.
         """
         sets, steps = len(self.gains), np.empty((len(plan.errors2), 4))
-        noise = default_noise(self.max_value) if self.freedom else self._noise_of_pairs(plan, least, sigmas)
+        noise = default_noise(self.max_value)
+        if not self.freedom:
+            good = self.good(noise, least, sigmas)
+            noise = noise_of_pairs(plan, self.phases, self.modulations, self.mean, good, self.max_value)
         weights = self._weights(noise)
         cycles2, fitted = judge(
             self.phases.reshape(sets, -1), self.modulations.reshape(sets, -1), self.mean.reshape(-1),
@@ -117,16 +121,6 @@ class Sample:
     def _weights(self, noise: NoiseModel) -> NDArray[np.float32]:
         """Of `mark_good`, where residuals count."""
         return np.array([noise.read, noise.per_level, ROUNDING_VARIANCE, self.prior, self.freedom, 1], np.float32)
-
-    def _noise_of_pairs(self, plan: AxisPlan, least: float, sigmas: float) -> NoiseModel:
-        good = self.good(default_noise(self.max_value), least, sigmas)
-        pair = good[:, :-PAIR_DISTANCE] & good[:, PAIR_DISTANCE:]
-        pixels = slice(None, -PAIR_DISTANCE), slice(PAIR_DISTANCE, None)
-        phases = np.stack([self.phases[:, :, at][:, pair] for at in pixels])
-        gains = self.gains[:, None] / np.float32(4 * np.pi**2)
-        per_variance = np.stack([gains / self.modulations[:, :, at][:, pair] ** 2 for at in pixels])
-        level = (self.mean[:, pixels[0]][pair] + self.mean[:, pixels[1]][pair]) * np.float32(0.5)
-        return noise_of_pairs(plan.ladder, phases, per_variance, level, plan.centre, self.max_value)
 
 
 @dataclass(frozen=True)

@@ -270,18 +270,12 @@ def judge_steps(
         return
     absolute, remainder = np.empty(size), np.empty(size)
     variance, apart = np.empty(size, np.float32), np.empty(size, np.float32)
-    _beat(phases, combinations[0], absolute)
-    for i in range(size):
-        absolute[i] -= np.rint(absolute[i] - frequencies[0] * centre)
+    first_rung(phases, combinations[0], frequencies[0] * centre, absolute)
     for j in range(steps):
-        _beat(phases, combinations[j + 1], remainder)
+        beat_of(phases, combinations[j + 1], remainder)
         ratio = frequencies[j + 1] / frequencies[j]
+        step_up(absolute, remainder, ratio)
         for i in range(size):
-            psi = remainder[i]
-            difference = ratio * absolute[i] - psi
-            order = np.rint(difference)
-            remainder[i] = difference - order
-            absolute[i] = psi + order
             apart[i] = np.float32(abs(remainder[i]))
             variance[i] = np.float32(0)
         weight = 0.0
@@ -315,13 +309,35 @@ def _unexplained(x: NDArray[np.float32], medians: NDArray[np.float32], folded: N
 
 
 @kernel
-def _beat(phases: NDArray[np.float32], combination: NDArray[np.float64], beat: NDArray[np.float64]) -> None:
+def first_rung(
+    phases: NDArray[np.float32], combination: NDArray[np.float64], middle: float, absolute: NDArray[np.float64]
+) -> None:
+    """Write the coarsest rung's absolute phase, (n,) cycles; middle: its phase at the field's centre."""
+    beat_of(phases, combination, absolute)
+    for i in range(absolute.size):
+        absolute[i] -= np.rint(absolute[i] - middle)
+
+
+@kernel
+def beat_of(phases: NDArray[np.float32], combination: NDArray[np.float64], beat: NDArray[np.float64]) -> None:
     """Write one rung's phase, (n,) cycles."""
     beat[:] = 0
     for k in range(combination.size):
         if combination[k] != 0:
             for i in range(beat.size):
                 beat[i] += combination[k] * phases[k, i]
+
+
+@kernel
+def step_up(absolute: NDArray[np.float64], beat: NDArray[np.float64], ratio: float) -> None:
+    """From a rung to the next. absolute: (n,) cycles, changed to those of the next. beat: its phase, changed to what is
+    left of the step. ratio: of its frequency to the one before."""
+    for i in range(beat.size):
+        psi = beat[i]
+        difference = ratio * absolute[i] - psi
+        order = np.rint(difference)
+        beat[i] = difference - order
+        absolute[i] = psi + order
 
 
 @summing_kernel
