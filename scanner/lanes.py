@@ -26,10 +26,6 @@ LANES = 32
 """Pixels a vector. Twice the widest registers' sixteen: two chains of operations wait for each other less than one."""
 
 
-_LINE = 64
-"""Bytes of a cache line, and of the widest registers."""
-
-
 class Lanes(Protocol):
     """What a kernel may do with lanes."""
 
@@ -84,7 +80,7 @@ def _kind_of(*given: Any) -> _LanesType | None:
     return next(iter(found.values())) if joins and len(found) == 1 else None
 
 
-def _in_lanes(context: Any, builder: Any, value: Any, found: Any, kind: _LanesType) -> Any:
+def in_lanes(context: Any, builder: Any, value: Any, found: Any, kind: _LanesType) -> Any:
     """A value as lanes: a scalar goes to all of them."""
     if isinstance(found, _LanesType):
         return value
@@ -106,7 +102,7 @@ def _teach(operation: Any, results: dict[str, _LanesType], make: Callable[[Any, 
 
     def lower(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         kind = cast(_LanesType, _kind_of(*signature.args))
-        a, b = (_in_lanes(context, builder, v, t, kind) for v, t in zip(values, signature.args, strict=True))
+        a, b = (in_lanes(context, builder, v, t, kind) for v, t in zip(values, signature.args, strict=True))
         return make(builder, a, b, kind is _FLOATS)
 
     _extending.type_callable(operation)(typer_of)
@@ -167,7 +163,7 @@ def _intrinsic(function: Callable[..., Any]) -> Any:
 
 
 FLOATS, WHOLE, MASK, LanesType, intrinsic = _FLOATS, _WHOLE, _MASK, _LanesType, _intrinsic
-"""For more functions of lanes: `scanner.across_lanes`, `scanner.lane_quads`."""
+"""For more functions of lanes: `scanner.across_lanes`, `scanner.lane_quads`, `scanner.lane_memory`."""
 
 
 def _call(builder: Any, name: str, values: Any) -> Any:
@@ -196,7 +192,7 @@ def _choose(context: Any, mask: Any, a: Any, b: Any) -> Any:
     kind = _kind_of(a, b) or (_FLOATS if isinstance(a, types.Float) else _WHOLE)
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        picked = [_in_lanes(context, builder, v, t, kind) for v, t in zip(values[1:], signature.args[1:], strict=True)]
+        picked = [in_lanes(context, builder, v, t, kind) for v, t in zip(values[1:], signature.args[1:], strict=True)]
         return builder.select(values[0], *picked)
 
     return (kind(mask, a, b), generate) if mask is _MASK else None
@@ -208,7 +204,7 @@ choose: Callable[[Any, Any, Any], Lanes] = _intrinsic(_choose)
 
 def _multiply_add(context: Any, a: Any, b: Any, c: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        three = [_in_lanes(context, builder, v, t, _FLOATS) for v, t in zip(values, signature.args, strict=True)]
+        three = [in_lanes(context, builder, v, t, _FLOATS) for v, t in zip(values, signature.args, strict=True)]
         return _call(builder, "fmuladd", three)
 
     return (_FLOATS(a, b, c), generate) if _kind_of(a, b, c) is _FLOATS else None
@@ -235,7 +231,7 @@ def _converted(kind: _LanesType, conversions: dict[str, str]) -> Callable[[Any],
             found = signature.args[0]
             if isinstance(found, _LanesType):
                 return values[0] if found is kind else getattr(builder, conversions[found.kind])(values[0], kind.vector)
-            return _in_lanes(context, builder, values[0], found, kind)
+            return in_lanes(context, builder, values[0], found, kind)
 
         return kind(x), generate
 
@@ -256,7 +252,7 @@ def _as_samples(context: Any, x: Any, like: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         if x is _FLOATS:
             return builder.fptosi(values[0], kind.vector)
-        return _in_lanes(context, builder, values[0], x, kind)
+        return in_lanes(context, builder, values[0], x, kind)
 
     return kind(x, like), generate
 
@@ -304,12 +300,13 @@ all_of: Callable[[Lanes], bool] = _intrinsic(_all_of)
 # --- memory -----------------------------------------------------------------------------------------------------------
 
 
-def _pointer(context: Any, builder: Any, array: Any, value: Any, at: Any, vector: Any) -> Any:
+def pointer_to(context: Any, builder: Any, array: Any, value: Any, at: Any, vector: Any) -> Any:
+    """Where a vector of that type begins at an element of an array, of (array's type, array, element)."""
     data = context.make_array(array)(context, builder, value).data
     return builder.bitcast(builder.gep(data, [at]), vector.as_pointer())
 
 
-def _address(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+def address_of(context: Any, builder: Any, signature: Any, values: Any) -> Any:
     """Where the frame's pixel lies, of (addresses, n, pixel, like)."""
     table = context.make_array(signature.args[0])(context, builder, values[0]).data
     bytes_each = ir.Constant(values[2].type, signature.args[3].dtype.bitwidth // 8)
@@ -322,7 +319,7 @@ def _samples(context: Any, addresses: Any, frame: Any, pixel: Any, like: Any) ->
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         vector = ir.VectorType(ir.IntType(bits), LANES)
-        pointer = builder.inttoptr(_address(context, builder, signature, values), vector.as_pointer())
+        pointer = builder.inttoptr(address_of(context, builder, signature, values), vector.as_pointer())
         return builder.zext(builder.load(pointer, align=bits // 8), kind.vector)
 
     return kind(addresses, types.intp, types.intp, like), generate
@@ -336,45 +333,27 @@ Those of 8 bits are short numbers, of which 128 may be added up; all others whol
 
 def _expect(context: Any, addresses: Any, frame: Any, pixel: Any, like: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        # llvm.prefetch(pointer, read, to the first-level cache, data); it never faults.
+        # llvm.prefetch(pointer, read, to the second-level cache, data); it never faults.
         pointer, integer = _compiler.voidptr_t, ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [pointer, integer, integer, integer])
         call = _compiler.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        options = [ir.Constant(integer, value) for value in (0, 3, 1)]
-        builder.call(call, [builder.inttoptr(_address(context, builder, signature, values), pointer), *options])
+        options = [ir.Constant(integer, value) for value in (0, 2, 1)]
+        builder.call(call, [builder.inttoptr(address_of(context, builder, signature, values), pointer), *options])
         return context.get_dummy_value()
 
     return types.void(addresses, types.intp, types.intp, like), generate
 
 
 expect: Callable[[NDArray[Any], int, int, NDArray[Any]], None] = _intrinsic(_expect)
-"""expect(addresses, n, pixel, like): have the processor fetch the cache line of that pixel, wherever it lies."""
+"""expect(addresses, n, pixel, like): have the processor fetch the cache line of that pixel, wherever it lies.
 
-
-def _align_stack(context: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        with builder.goto_entry_block():
-            place = builder.alloca(_FLOATS.vector)
-            place.align = _LINE
-        # Nothing at all is done with it; but it is there, and what else lies on the stack is aligned with it.
-        kind = ir.FunctionType(ir.VoidType(), [place.type])
-        builder.call(ir.InlineAsm(kind, "", "r", side_effect=True), [place])
-        return context.get_dummy_value()
-
-    return types.void(), generate
-
-
-align_stack: Callable[[], None] = _intrinsic(_align_stack)
-"""Put the kernel's stack on whole cache lines. To be called once, first, where many vectors are alive together.
-
-Vectors that find no register lie on the stack, which by itself begins at any multiple of 16 bytes: in three processes
-of four each of them lies across two lines then, and the kernel may take half as long again."""
+Into its second cache: of frames that lie a multiple of a page apart, the first has room for a dozen lines only."""
 
 
 def _load(context: Any, array: Any, at: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         return builder.load(
-            _pointer(context, builder, signature.args[0], values[0], values[1], _FLOATS.vector), align=4
+            pointer_to(context, builder, signature.args[0], values[0], values[1], _FLOATS.vector), align=4
         )
 
     return _FLOATS(array, types.intp), generate
@@ -384,23 +363,6 @@ load: Callable[[NDArray[Any], int], Lanes] = _intrinsic(_load)
 """load(row, at): floats from row[at] on, of a (n,) float32 array. Nothing checks that there are as many."""
 
 
-def _stream(context: Any, array: Any, at: Any, lanes: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        row, first, value = values
-        pointer = _pointer(context, builder, signature.args[0], row, first, value.type)
-        stored = builder.store(value, pointer, align=_LINE)
-        stored.set_metadata("nontemporal", builder.module.add_metadata([ir.Constant(ir.IntType(32), 1)]))
-        return context.get_dummy_value()
-
-    return (types.void(array, types.intp, lanes), generate) if lanes is _FLOATS else None
-
-
-stream: Callable[[NDArray[Any], int, Lanes], None] = _intrinsic(_stream)
-"""stream(row, at, lanes): floats into a (n,) float32 array that nobody reads soon, past the caches.
-
-row[at] must begin a cache line (`scanner.decode.addresses.aligned_rows`): anything else ends the process."""
-
-
 def _store(context: Any, array: Any, at: Any, lanes: Any) -> Any:
     bits = array.dtype.bitwidth
 
@@ -408,7 +370,7 @@ def _store(context: Any, array: Any, at: Any, lanes: Any) -> Any:
         row, first, value = values
         if lanes is not _FLOATS and bits < lanes.scalar.bitwidth:
             value = builder.trunc(value, ir.VectorType(ir.IntType(bits), LANES))
-        pointer = _pointer(context, builder, signature.args[0], row, first, value.type)
+        pointer = pointer_to(context, builder, signature.args[0], row, first, value.type)
         builder.store(value, pointer, align=bits // 8)
         return context.get_dummy_value()
 

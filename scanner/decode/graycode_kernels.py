@@ -17,6 +17,7 @@ from scanner.decode.addresses import CACHE_LINE, aligned_rows, copies_of, keep, 
 from scanner.decode.graycode_bits import BOTH, levels_of_pairs, read_bits, value_and_spread
 from scanner.decode.reasons import count_reasons
 from scanner.kernel import contracting_kernel, inlined_kernel
+from scanner.lane_memory import stream
 from scanner.lanes import (
     LANES,
     Lanes,
@@ -31,7 +32,6 @@ from scanner.lanes import (
     root,
     samples,
     store,
-    stream,
 )
 
 AHEAD = 512

@@ -4,8 +4,8 @@ Frames are given by the addresses of their pixels, so that they may lie anywhere
 Work goes through the image by vectors of pixels (`scanner.lanes`). A vector's samples are read once; sums, phases,
 fringe orders and the verdict follow, and only phases and modulations go through memory in between, a few cache lines.
 What no pixel of a vector needs is left out: a way up the ladder where nothing is lit, an exponential where no order is
-in doubt. What a pixel's noise is, and how the ladder of beats climbs, is decided by the caller. Each rung in proportion
-picks the period of the next (Huntley and Saldner 1993); the noise of a phase from that of its samples: Surrel 1997.
+in doubt. What a pixel's noise is, and how the ladder of beats climbs, is decided by the caller. Sums are those of
+`pmp_sums`, orders those of `pmp_climb`; the noise of a phase follows from that of its samples (Surrel 1997).
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode.addresses import CACHE_LINE, aligned_rows, copies_of, keep
+from scanner.decode.pmp_climb import climb, combine, plan_rows
 from scanner.decode.pmp_sums import fit_lanes, turns_of
 from scanner.decode.reasons import count_reasons
 from scanner.kernel import contracting_kernel, inlined_kernel
+from scanner.lane_memory import align_stack, stream
 from scanner.lanes import (
     LANES,
     Lanes,
-    align_stack,
     all_of,
     any_of,
     choose,
@@ -33,7 +34,6 @@ from scanner.lanes import (
     load,
     magnitude,
     nearest,
-    power_of_two,
     root,
     store,
     whole,
@@ -41,22 +41,9 @@ from scanner.lanes import (
 
 _F0 = np.float32(0)
 _F1 = np.float32(1)
-_F2 = np.float32(2)
 _HALF = np.float32(0.5)
 _NAN = np.float32(np.nan)
-_HUGE = np.float32(1e30)
 _PER_TURN2 = np.float32(1 / (2 * np.pi) ** 2)
-
-# 2^x on [-1/2, 1/2], Taylor terms in ln 2; relative error below 5e-5.
-_P1 = np.float32(np.log(2))
-_P2 = np.float32(np.log(2) ** 2 / 2)
-_P3 = np.float32(np.log(2) ** 3 / 6)
-_P4 = np.float32(np.log(2) ** 4 / 24)
-_LOG2_E_HALF = np.float32(-0.5 * np.log2(np.e))
-_LEAST_POWER = np.float32(-120)
-
-_CERTAIN = np.float32(60)
-"""(1 - 2 |r|) / sigma^2 whose odds, e^-30, are nothing beside 1 in float32, for as many steps as there may be."""
 
 AHEAD = 1024
 """Pixels between the one that is worked on and the one that is asked for: 2 us, several times what memory takes."""
@@ -122,18 +109,21 @@ def decode_pixels(
     sets, steps = gains.size, ratios.size
     # Behind phases and B^2 by set: what the ladder combines of sets, a beat for each rung, a spread for each step.
     spot = aligned_rows(2 * sets + 2 * steps + 1, LANES).reshape(-1)
-    beats, terms, parts = _plan(rungs, errors, gains)
+    beats, terms, parts = plan_rows(rungs, errors, gains)
+    combined = beats.max() >= 2 * sets or (steps > 0 and terms[:, 0].max() >= 2 * sets)
     turns = turns_of(starts, weights, shifts)
     unit = _F1 / np.float32(clip) ** 2
     line = CACHE_LINE // like.itemsize
+    maps = position.ctypes.data | confidence.ctypes.data | sigma.ctypes.data
+    aligned = (maps | albedo.ctypes.data | modulation.ctypes.data | (4 * begin)) % CACHE_LINE == 0
     solid = begin + (end - begin) // LANES * LANES
     for at in range(begin, solid, LANES):
-        if at % line == 0:
+        if at & (line - 1) == 0:
             for n in range(addresses.size):
                 expect(addresses, n, at + AHEAD, like)
         _decode_lanes(
             addresses, like, starts, weights, grams, shifts, turns, clip, gains, rungs, ratios, errors, floors, noise,
-            scale, limits, periodic, finest, beats, terms, parts, unit, spot, at, at,
+            scale, limits, periodic, finest, beats, terms, parts, combined, unit, spot, at, at, aligned,
             position, sigma, confidence, albedo, modulation, reason,
         )  # fmt: skip
     if solid < end:
@@ -142,7 +132,7 @@ def decode_pixels(
         copies, last = copies_of(addresses, solid, size, like, spare), aligned_rows(5, LANES)
         _decode_lanes(
             copies, like, starts, weights, grams, shifts, turns, clip, gains, rungs, ratios, errors, floors, noise,
-            scale, limits, periodic, finest, beats, terms, parts, unit, spot, solid, 0,
+            scale, limits, periodic, finest, beats, terms, parts, combined, unit, spot, solid, 0, False,
             last[0], last[1], last[2], last[3], last[4], last_reason,
         )  # fmt: skip
         keep(spare)
@@ -178,10 +168,12 @@ def _decode_lanes(
     beats: NDArray[np.intp],
     terms: NDArray[np.intp],
     parts: NDArray[np.float32],
+    combined: bool,
     unit: np.float32,
     spot: NDArray[np.float32],
     at: int,
     to: int,
+    past_caches: bool,
     position: NDArray[np.float32],
     sigma: NDArray[np.float32],
     confidence: NDArray[np.float32],
@@ -192,15 +184,16 @@ def _decode_lanes(
     """Decode LANES pixels from `at` on, into the maps from `to` on."""
     sets = gains.size
     v0, slope, least_variance, prior, shrink = noise[0], noise[1], noise[2], noise[3], noise[4]
-    mean, residual, top = fit_lanes(addresses, like, starts, weights, grams, shifts, turns, at, spot)
+    mean, residual, clear = fit_lanes(addresses, like, starts, weights, grams, shifts, turns, clip, at, spot)
     model = greatest(v0 + slope * mean, least_variance)
     # A residual can show a pixel to be noisier than the model has it; a small one is luck more often than not.
     variance = greatest((prior * model + residual) * shrink, model)
-    lit, some = _lit(spot, gains, limits[0] * limits[0], limits[1], variance)
+    lit = _lit(spot, gains, limits[0] * limits[0], limits[1], variance)
     absolute, wrong = floats(_F0), floats(_F1)
     if any_of(lit):
-        _combine(spot, rungs, errors, gains, beats, terms)
-        absolute, wrong = _climb(spot, beats, terms, parts, ratios, floors, scale[2], limits[4], unit, sets, variance)
+        if combined:
+            combine(spot, rungs, errors, gains, beats, terms)
+        absolute, wrong = climb(spot, beats, terms, parts, ratios, floors, scale[2], limits[4], unit, sets, variance)
     along, origin, fine, low = scale[0], scale[1], scale[3], scale[4] + _HALF
     cycles = absolute * (_F1 / fine)
     if periodic:
@@ -212,163 +205,60 @@ def _decode_lanes(
     # Farther from both ends than so many sigmas, without a root: squares that keep their sign.
     edge = limits[6] if periodic else -limits[6]
     room = least(value + _HALF, (along - _HALF) - value)
-    inside = (room * magnitude(room)) * square > (edge * abs(edge)) * spread
+    # What is lit has a sigma of no more than this; nearly all pixels are farther from the ends than by that.
+    inside = room > (abs(edge) * along / fine) * np.sqrt(_PER_TURN2 / limits[1])
+    if not all_of(inside):
+        inside = (room * magnitude(room)) * square > (edge * abs(edge)) * spread
     freedom = max(_F1 / shrink - prior, _F1)
-    still = (residual <= (limits[2] * freedom) * model) | (residual <= (limits[3] * freedom) * square)
-    good = inside & lit & still & (wrong <= limits[5]) & (top < clip)
+    still = residual <= greatest((limits[2] * freedom) * model, (limits[3] * freedom) * square)
+    good = inside & lit & still & (wrong <= limits[5]) & clear
     known, why = good, whole(0)
     if not all_of(good):
         why = choose(inside, 0, 5)
         why = choose(wrong <= limits[5], why, 4)
         why = choose(lit, why, 3)
-        why = choose(some, why, 1)
+        why = choose(_some_lit(spot, gains, limits[0] * limits[0], limits[1], variance), why, 1)
         why = choose(still, why, 7)
-        why = choose(top < clip, why, 2)
+        why = choose(clear, why, 2)
         known = good | ((why > 3) & (why < 5))
         value, wrong = choose(known, value, _NAN), choose(good, wrong, _F1)
-    store(position, to, value)
-    store(confidence, to, _F1 - wrong)
+    _put(position, to, value, past_caches)
+    _put(confidence, to, _F1 - wrong, past_caches)
     store(reason, to, why)
     if sigma.size > 0:
-        store(sigma, to, choose(known, root(spread / square), _NAN))
-        store(albedo, to, mean)
-        store(modulation, to, root(square))
-
-
-# --- the ladder as rows -----------------------------------------------------------------------------------------------
-
-
-@contracting_kernel
-def _plan(
-    rungs: NDArray[np.float32],
-    errors: NDArray[np.float32],
-    gains: NDArray[np.float32],
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
-    """Which rows the ladder climbs by: (J,) of each rung's phase; (J - 1, 2) of each step's B^2, (J - 1, 2) weights.
-
-    A rung that is one set is that set's phase, and an error of two sets is made up of theirs; others are combined in
-    rows of their own before, which lie behind those of the sets.
-    """
-    steps, sets = errors.shape
-    first_beat, first_spread = 2 * sets, 2 * sets + steps + 1
-    beats = np.empty(steps + 1, np.intp)
-    terms = np.full((steps, 2), sets)
-    parts = np.zeros((steps, 2), np.float32)
-    for j in range(steps + 1):
-        single = _only(rungs[j])
-        beats[j] = single if single >= 0 else first_beat + j
-    for j in range(steps):
-        count = 0
-        for k in range(sets):
-            if errors[j, k] != _F0:
-                if count < 2:
-                    terms[j, count] = sets + k
-                    parts[j, count] = errors[j, k] * gains[k] * _PER_TURN2
-                count += 1
-        if count > 2:
-            terms[j, 0] = first_spread + j
-    return beats, terms, parts
-
-
-@contracting_kernel
-def _only(rung: NDArray[np.float32]) -> int:
-    """The set that is this rung all by itself; -1 where it is a combination."""
-    only = -1
-    for k in range(rung.size):
-        if rung[k] != _F0:
-            if rung[k] != _F1 or only >= 0:
-                return -1
-            only = k
-    return only
+        _put(sigma, to, choose(known, root(spread / square), _NAN), past_caches)
+        _put(albedo, to, mean, past_caches)
+        _put(modulation, to, root(square), past_caches)
 
 
 @inlined_kernel
-def _combine(
-    spot: NDArray[np.float32],
-    rungs: NDArray[np.float32],
-    errors: NDArray[np.float32],
-    gains: NDArray[np.float32],
-    beats: NDArray[np.intp],
-    terms: NDArray[np.intp],
-) -> None:
-    """Write the rows that are no set's own: phases of beats, and the sum of weight / B^2 of errors of three sets."""
-    sets = gains.size
-    for j in range(beats.size):
-        if beats[j] >= 2 * sets:
-            total = floats(_F0)
-            for k in range(sets):
-                total += rungs[j, k] * load(spot, k * LANES)
-            store(spot, beats[j] * LANES, total)
-    for j in range(terms.shape[0]):
-        if terms[j, 0] >= 2 * sets:
-            total = floats(_F0)
-            for k in range(sets):
-                total += errors[j, k] * gains[k] * _PER_TURN2 / load(spot, (sets + k) * LANES)
-            store(spot, terms[j, 0] * LANES, total)
+def _put(row: NDArray[np.float32], to: int, value: Lanes, past_caches: bool) -> None:
+    # What is written to memory without being read from it before leaves that to the frames.
+    if past_caches:
+        stream(row, to, value)
+    else:
+        store(row, to, value)
 
 
 @inlined_kernel
 def _lit(
     spot: NDArray[np.float32], gains: NDArray[np.float32], min_b2: np.float32, min_sigmas2: np.float32, variance: Lanes
-) -> tuple[Lanes, Lanes]:
-    """Where all sets have enough modulation, and where any has."""
+) -> Lanes:
+    """Where all sets have enough modulation."""
     sets = gains.size
     lit = load(spot, sets * LANES) >= greatest(min_sigmas2 * gains[0] * variance, min_b2)
-    some = lit
     for k in range(1, sets):
-        enough = load(spot, (sets + k) * LANES) >= greatest(min_sigmas2 * gains[k] * variance, min_b2)
-        lit, some = lit & enough, some | enough
-    return lit, some
-
-
-# --- fringe orders ----------------------------------------------------------------------------------------------------
+        lit = lit & (load(spot, (sets + k) * LANES) >= greatest(min_sigmas2 * gains[k] * variance, min_b2))
+    return lit
 
 
 @inlined_kernel
-def _climb(
-    spot: NDArray[np.float32],
-    beats: NDArray[np.intp],
-    terms: NDArray[np.intp],
-    parts: NDArray[np.float32],
-    ratios: NDArray[np.float32],
-    floors: NDArray[np.float32],
-    centre: np.float32,
-    max_remainder2: np.float32,
-    unit: np.float32,
-    sets: int,
-    variance: Lanes,
-) -> tuple[Lanes, Lanes]:
-    """Up the ladder: the finest rung's absolute phase, and the probability that an order is wrong."""
-    absolute = load(spot, beats[0] * LANES)
-    absolute -= nearest(absolute - centre)
-    # The step that came nearest to the neighbouring order, and by what sigma; the worst remainder.
-    margin, spread, worst = floats(_HUGE), floats(_F1), floats(-_F1)
-    for j in range(ratios.size):
-        if terms[j, 0] < 2 * sets:
-            # a / B1^2 + b / B2^2 without the divisions: all that follows is times both.
-            one, two = unit * load(spot, terms[j, 0] * LANES), load(spot, terms[j, 1] * LANES)
-            weight = one * two
-            error2 = variance * (parts[j, 0] * unit * two + parts[j, 1] * one) + floors[j] * weight
-        else:
-            weight = floats(_F1)
-            error2 = variance * load(spot, terms[j, 0] * LANES) + floors[j]
-        beat = load(spot, beats[j + 1] * LANES)
-        difference = ratios[j] * absolute - beat
-        order = nearest(difference)
-        remainder = difference - order
-        absolute = beat + order
-        room = (_F1 - _F2 * magnitude(remainder)) * weight
-        # room / error2 < the least so far, without a division
-        nearer = room * spread < margin * error2
-        margin, spread = choose(nearer, room, margin), choose(nearer, error2, spread)
-        worst = greatest(worst, remainder * remainder * weight - max_remainder2 * error2)
-    # Odds of the neighbouring order against the nearest, for a normal error: exp(-(1 - 2 |r|) / (2 sigma^2)).
-    # The step in most danger stands for all.
-    wrong = floats(_F0)
-    if any_of(margin < _CERTAIN * spread):
-        power = greatest(margin / spread * _LOG2_E_HALF, _LEAST_POWER)
-        exponent = nearest(power)
-        x = power - exponent
-        odds = (_F1 + x * (_P1 + x * (_P2 + x * (_P3 + x * _P4)))) * power_of_two(whole(exponent))
-        wrong = np.float32(ratios.size) * odds
-    return absolute, choose(worst > _F0, _F1, wrong)
+def _some_lit(
+    spot: NDArray[np.float32], gains: NDArray[np.float32], min_b2: np.float32, min_sigmas2: np.float32, variance: Lanes
+) -> Lanes:
+    """Where any set has."""
+    sets = gains.size
+    some = load(spot, sets * LANES) >= greatest(min_sigmas2 * gains[0] * variance, min_b2)
+    for k in range(1, sets):
+        some = some | (load(spot, (sets + k) * LANES) >= greatest(min_sigmas2 * gains[k] * variance, min_b2))
+    return some

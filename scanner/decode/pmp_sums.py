@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from scanner.decode.addresses import aligned_rows, copies_of
 from scanner.kernel import contracting_kernel, inlined_kernel
+from scanner.lane_memory import align_stack
+from scanner.lane_quads import any_reaches, brighter, brightest, dot, energy, has_quads, no_quads, quads, weights_of
 from scanner.lanes import (
     LANES,
     Lanes,
-    align_stack,
+    as_samples,
     choose,
     expect,
     floats,
@@ -30,6 +32,7 @@ from scanner.lanes import (
     root,
     samples,
     store,
+    whole,
     with_sign,
 )
 
@@ -51,6 +54,14 @@ _EIGHTH = np.float32(0.125)
 _SIXTEENTH = np.float32(0.0625)
 _ROOT_HALF = np.float32(0.5**0.5)
 _TINY = np.float32(1e-12)
+_MIDDLE = np.float32(128)
+
+# cos and sin of eighths of a turn as whole numbers: 99 / 70 is the square root of 2 but for 5e-5. What that leaves of
+# the exact ratio is the same for both sums of any fringe, and goes into their scale.
+_P_FIRST, _P_LATER = weights_of(99, 70, 0, -70), weights_of(-99, -70, 0, 70)
+_Q_FIRST, _Q_LATER = weights_of(0, 70, 99, 70), weights_of(0, -70, -99, -70)
+_LONG_EIGHT = np.float32((2 * 99 + 2 * 2**0.5 * 70) ** -2)
+_P_FOUR, _Q_FOUR, _ONES = weights_of(1, 0, -1, 0), weights_of(0, 1, 0, -1), weights_of(1, 1, 1, 1)
 _PER_TURN = np.float32(1 / (2 * np.pi))
 
 # atan(x) / (2 pi x) in x^2 on [0, 1]: least-maximum fit of six terms, error of atan(x) / 2 pi below 3e-7.
@@ -69,7 +80,7 @@ def fit_runs(
     starts: NDArray[np.intp],
     weights: NDArray[np.float32],
     grams: NDArray[np.float32],
-    whole: NDArray[np.intp],
+    shifts: NDArray[np.intp],
     clip: int,
     pixels: int,
     runs: NDArray[np.intp],
@@ -83,7 +94,7 @@ def fit_runs(
     """Fit the sets at a sample of pixels: `length` of them from each of `runs` on.
 
     Args:
-        addresses, like, starts, weights, grams, whole, clip: see `decode_pixels`.
+        addresses, like, starts, weights, grams, shifts, clip: see `decode_pixels`.
         pixels: of a frame.
         runs: (R,) first pixel of each run.
         phases, modulations: (K, R x length) float32, written: cycles, grey levels.
@@ -92,7 +103,7 @@ def fit_runs(
     """
     align_stack()
     sets = starts.size - 1
-    turns = turns_of(starts, weights, whole)
+    turns = turns_of(starts, weights, shifts)
     spot = aligned_rows(2 * sets + 3, LANES).reshape(-1)
     spare = np.zeros((addresses.size, LANES), like.dtype)
     flat_phases, flat_modulations = phases.reshape(-1), modulations.reshape(-1)
@@ -109,11 +120,11 @@ def fit_runs(
                 begin = at
             else:
                 near = addresses
-            a, rest, top = fit_lanes(near, like, starts, weights, grams, whole, turns, begin, spot)
+            a, rest, clear = fit_lanes(near, like, starts, weights, grams, shifts, turns, clip, begin, spot)
             to, skip = r * length + done, at - begin
-            store(spot, (2 * sets + 2) * LANES, floats(top))
+            store(spot, (2 * sets + 2) * LANES, choose(clear, _F0, _F1))
             for i in range(size):
-                clipped[to + i] = spot[(2 * sets + 2) * LANES + skip + i] >= clip
+                clipped[to + i] = spot[(2 * sets + 2) * LANES + skip + i] > _F0
             if size == LANES and skip == 0:
                 for k in range(sets):
                     store(flat_phases, k * mean.size + to, load(spot, k * LANES))
@@ -142,14 +153,14 @@ def _expect_run(addresses: NDArray[np.intp], like: NDArray[Any], runs: NDArray[n
 
 
 @contracting_kernel
-def turns_of(starts: NDArray[np.intp], weights: NDArray[np.float32], whole: NDArray[np.intp]) -> NDArray[np.float32]:
+def turns_of(starts: NDArray[np.intp], weights: NDArray[np.float32], shifts: NDArray[np.intp]) -> NDArray[np.float32]:
     """(K, 2): how the phase of a set of four or eight counts: which way, 1 or -1, and from where, cycles."""
-    turns = np.empty((whole.size, 2), np.float32)
-    for k in range(whole.size):
+    turns = np.empty((shifts.size, 2), np.float32)
+    for k in range(shifts.size):
         turns[k, 0], turns[k, 1] = _F1, _F0
-        if whole[k] != 0:
+        if shifts[k] != 0:
             p, q = weights[1, starts[k]], weights[2, starts[k]]
-            quarter = starts[k] + whole[k] // 4
+            quarter = starts[k] + shifts[k] // 4
             turns[k, 0] = _F1 if p * weights[2, quarter] - q * weights[1, quarter] > _F0 else -_F1
             turns[k, 1] = np.float32(np.arctan2(q, p)) * _PER_TURN
     return turns
@@ -162,35 +173,79 @@ def fit_lanes(
     starts: NDArray[np.intp],
     weights: NDArray[np.float32],
     grams: NDArray[np.float32],
-    whole: NDArray[np.intp],
+    shifts: NDArray[np.intp],
     turns: NDArray[np.float32],
+    clip: int,
     at: int,
     spot: NDArray[np.float32],
 ) -> tuple[Lanes, Lanes, Lanes]:
-    """Fit all sets at LANES pixels from `at` on: mean of their A, sum of their squared residuals, the brightest sample.
+    """Fit all sets at LANES pixels from `at` on: mean of their A, sum of their squared residuals, where nothing clips.
 
     Args:
         spot: (2 K, LANES) and more, flat, float32, written: phases, cycles; B^2.
     """
     sets = starts.size - 1
     share = _F1 / np.float32(sets)
-    mean, residual, top = floats(_F0), floats(_F0), samples(addresses, 0, at, like)
+    mean, residual, top = floats(_F0), floats(_F0), as_samples(0, like)
+    # Of sets that are fitted in quads: samples' energy and sum from the middle of their range, the brightest.
+    squares, sums, bright, level, dotted = whole(0), whole(0), no_quads(), floats(_F0), 0
     for k in range(sets):
-        first = starts[k]
-        if whole[k] == 8:
-            p, q, scale, level, rest, high = _fit_eight(addresses, like, first, share, at)
-        elif whole[k] == 4:
-            p, q, scale, level, rest, high = _fit_four(addresses, like, first, share, at)
+        first, count = starts[k], shifts[k]
+        if has_quads(like) and count != 0:
+            if count == 8:
+                p, q, total, squares, bright = _sum_eight(addresses, like, first, at, squares, bright)
+                scale, part = _LONG_EIGHT, _EIGHTH
+            else:
+                p, q, total, squares, bright = _sum_four(addresses, like, first, at, squares, bright)
+                scale, part = _QUARTER, _QUARTER
+            square = scale * (p * p + q * q) + _TINY
+            a, half = floats(total), _HALF / part
+            sums, level = sums + total, level + part * a
+            dotted += 1
+            residual -= a * (part * a) + half * square
         else:
-            p, q, scale, level, rest, high = _fit_any(
-                addresses, like, first, starts[k + 1], weights, grams[k], share, at
-            )
-        mean += level
-        residual += rest
-        top = greatest(top, high)
+            if count == 8:
+                p, q, scale, own, rest, high = _fit_eight(addresses, like, first, share, at)
+            elif count == 4:
+                p, q, scale, own, rest, high = _fit_four(addresses, like, first, share, at)
+            else:
+                p, q, scale, own, rest, high = _fit_any(
+                    addresses, like, first, starts[k + 1], weights, grams[k], share, at
+                )
+            square = scale * (p * p + q * q) + _TINY
+            mean += own
+            residual += rest
+            top = greatest(top, high)
         store(spot, k * LANES, turns[k, 0] * _phase(p, q) + turns[k, 1])
-        store(spot, (sets + k) * LANES, scale * (p * p + q * q) + _TINY)
-    return mean, residual, top
+        store(spot, (sets + k) * LANES, square)
+    clear = top < clip
+    if has_quads(like):
+        mean += share * (level + np.float32(dotted) * _MIDDLE)
+        # x (x - 128) = y^2 + 128 y for y = x - 128
+        residual = greatest(residual + floats(squares - 128 * sums), _F0)
+        if any_reaches(bright, clip):
+            clear = clear & (brightest(bright) < clip)
+    return mean, residual, clear
+
+
+@inlined_kernel
+def _sum_eight(
+    addresses: NDArray[np.intp], like: NDArray[Any], first: int, at: int, squares: Lanes, bright: Lanes
+) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes]:
+    """p and q, scaled; sum from the middle; energy and brightest with those of sets before."""
+    x, y = quads(addresses, first, at, like), quads(addresses, first + 4, at, like)
+    p, q = dot(y, _P_LATER, dot(x, _P_FIRST, 0)), dot(y, _Q_LATER, dot(x, _Q_FIRST, 0))
+    total = dot(y, _ONES, dot(x, _ONES, -8 * 128))
+    return floats(p), floats(q), total, energy(y, energy(x, squares)), brighter(bright, brighter(x, y))
+
+
+@inlined_kernel
+def _sum_four(
+    addresses: NDArray[np.intp], like: NDArray[Any], first: int, at: int, squares: Lanes, bright: Lanes
+) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes]:
+    x = quads(addresses, first, at, like)
+    p, q, total = dot(x, _P_FOUR, 0), dot(x, _Q_FOUR, 0), dot(x, _ONES, -4 * 128)
+    return floats(p), floats(q), total, energy(x, squares), brighter(bright, x)
 
 
 @inlined_kernel
