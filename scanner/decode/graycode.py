@@ -18,23 +18,26 @@ from scanner.decode import Coordinates, Decoded, Map, Reason
 from scanner.decode.addresses import addresses_of, maps_to_fill
 from scanner.decode.frames import FrameCheck
 from scanner.decode.graycode_bits import BOTH, INVERSE, PLAIN
-from scanner.decode.graycode_blur import blurred_bits, shares_decided
-from scanner.decode.graycode_kernels import decode_codes, gather
-from scanner.decode.middles import nth_of
+from scanner.decode.graycode_blur import blurred_bits, share_to_count, shares_decided
+from scanner.decode.graycode_kernels import decode_codes
+from scanner.decode.graycode_noise import noise_factor
 from scanner.decode.noise import ROUNDING_VARIANCE, default_noise
 from scanner.decode.reasons import REASONS
 from scanner.decode.runs import runs_of
 from scanner.decode.strips import in_strips, threads_to_use
 from scanner.errors import DecodeError
-from scanner.lanes import LANES
 from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, ProjectorSize
 from scanner.patterns.description import Axis
+from scanner.sample_lanes import LINE
 
 SAMPLE = 4096
 """Pixels from which a capture's noise is judged, times the coarse bits: its median is good to 2 %."""
 
 ENOUGH = 1024
 """Pixels with light in them that a sample should have; larger ones are taken until it has, or there are no more."""
+
+LEAST_LIT = 100
+"""Of them, fewer than which tell nothing of the noise: the default model then stands as it is."""
 
 
 @dataclass(frozen=True)
@@ -119,9 +122,9 @@ class GrayDecoder:
         self._kept = {*sequence.fringes, *({sequence.white, sequence.black} - {None})}
         self._frames: dict[int, NDArray[Any]] = {}
         pixels = camera.width * camera.height
-        self._pixels, whole_vectors = pixels, -(-pixels // LANES) * LANES
-        self._maps = maps_to_fill(2 * len(pattern.axes) + 3, whole_vectors)
-        self._reason = np.full(whole_vectors, 0, np.uint8)
+        self._pixels, whole_lines = pixels, -(-pixels // LINE) * LINE
+        self._maps = maps_to_fill(2 * len(pattern.axes) + 3, whole_lines)
+        self._reason = np.full(whole_lines, 0, np.uint8)
 
     def add(self, position: int, frame: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
         """Take a copy of the frame at `position`.
@@ -149,8 +152,8 @@ class GrayDecoder:
         Raises:
             DecodeError: a bit cannot be told; the missing frames are named.
         """
-        codes, warnings, factor = self._judged()
-        return self._decoded(self._decode(codes, factor, brief=False), factor, warnings)
+        counts, factor, warnings = self._decode(brief=False)
+        return self._decoded(counts, factor, warnings)
 
     def coordinates(self) -> Coordinates:
         """In place of `finish`: the same coordinates and confidence, in less time: maps are most of what is moved.
@@ -160,22 +163,9 @@ class GrayDecoder:
         Raises:
             DecodeError: as `finish`.
         """
-        codes, warnings, factor = self._judged()
-        self._decode(codes, factor, brief=True)
+        *_, warnings = self._decode(brief=True)
         positions, _, (confidence, *_) = self._by_axis()
         return Coordinates(positions.get("y"), positions.get("x"), confidence, warnings)
-
-    def _judged(self) -> tuple[_Codes, tuple[str, ...], float]:
-        codes = self._codes()
-        warnings, factor = self._check_complete(codes), self._noise_factor(codes)
-        return codes, (*warnings, *self._blurred(codes, factor)), factor
-
-    def _blurred(self, codes: _Codes, factor: float) -> tuple[str, ...]:
-        noise, t = default_noise(self._camera.max_value), self._thresholds
-        shares = shares_decided(
-            codes.addresses, codes.levels, codes.like, self._pixels, noise, factor, t.decisive_share, t.decisive_sigmas
-        )
-        return tuple(blurred_bits(self._pattern, shares))
 
     # --- frames -------------------------------------------------------------------------------------------------
 
@@ -219,80 +209,52 @@ class GrayDecoder:
         return tuple(warnings)
 
     def _noise_factor(self, codes: _Codes) -> float:
-        """Variance over that of the default model, from what the images of a pixel have in common.
-
-        An image and its inverse add up to the same in all bits; without inverses an image is as light as white or as
-        dark as black.
-        """
-        model, max_value = default_noise(self._camera.max_value), self._camera.max_value
-        pixels, size = self._pixels, SAMPLE
+        model, limit = default_noise(self._camera.max_value), self._thresholds.min_contrast_levels
+        kinds, levels = codes.kinds[0, : codes.coarse], codes.levels
+        # The first axis's coarse bits: they have few borders of cells in them.
+        addresses, size = codes.addresses[0, : codes.coarse], SAMPLE
+        noise = np.array([model.read, model.per_level, ROUNDING_VARIANCE, limit, self._camera.max_value], np.float32)
         while True:
-            image, inverse, white, black = self._sample(codes, size)
-            lit = (white - black > self._thresholds.min_contrast_levels) & (white < max_value)
-            if np.count_nonzero(lit) >= ENOUGH or size >= pixels:
+            starts, length = runs_of(self._pixels, size)
+            lit, factor = noise_factor(addresses, kinds, levels, codes.like, starts, length, noise)
+            if lit >= ENOUGH or size >= self._pixels:
                 break
             size *= 8
-        if np.count_nonzero(lit) < 100:
-            return 1.0
-        if not lit.all():
-            here = np.flatnonzero(lit)
-            image, inverse = image.take(here, axis=1), inverse.take(here, axis=1)
-            white, black = white.take(here), black.take(here)
-        both = white + black
-        expected = model.variance(both * np.float32(0.5))
-        # The first axis's coarse bits: they have few borders of cells in them.
-        kinds = codes.kinds[0, : codes.coarse, None]
-        ratios = (image + inverse - both) ** 2 / (np.float32(4 if codes.has_levels else 3) * expected)
-        if not (kinds == BOTH).all():
-            one = np.where(kinds == INVERSE, inverse, image)
-            single = np.minimum(np.abs(one - white), np.abs(one - black)) ** 2 / (2 * expected)
-            ratios = np.where(kinds == BOTH, ratios, single)
-        ratios = ratios.reshape(-1)
-        # Borders are cut off at three sigmas, which leaves .973 of the mean square. (.455 is the median square: whole
-        # grey levels make it too coarse to be the measure itself.)
-        least = _middle(np.float32(ROUNDING_VARIANCE) / expected)
-        within = ratios <= 9 * max(_middle(ratios) / 0.455, least)
-        total = float(np.sum(ratios, where=within, dtype=np.float64))
-        return float(max(total / np.count_nonzero(within) / 0.973, least))
-
-    def _sample(self, codes: _Codes, size: int) -> tuple[Map, Map, Map, Map]:
-        """Coarse images of the first axis and their inverses, (bits, n) float32, white and black, (n,)."""
-        starts, length = runs_of(self._pixels, size)
-        wanted = codes.addresses[:1, : codes.coarse].transpose(2, 0, 1).reshape(2, -1)
-        table = np.concatenate([wanted.reshape(-1), codes.levels])
-        found = np.zeros((table.size, starts.size * length), self._camera.dtype)
-        here = np.flatnonzero(table)
-        taken = np.empty((here.size, found.shape[1]), self._camera.dtype)
-        gather(table[here], codes.like, starts, length, taken)
-        found[here] = taken
-        grey = found.astype(np.float32)
-        image, inverse = grey[: wanted.shape[1]], grey[wanted.shape[1] : -2]
-        if codes.has_levels:
-            return image, inverse, grey[-2], grey[-1]
-        return image, inverse, np.maximum(image, inverse).mean(axis=0), np.minimum(image, inverse).mean(axis=0)
+        return float(factor) if lit >= LEAST_LIT else 1.0
 
     # --- decoding -----------------------------------------------------------------------------------------------
 
-    def _decode(self, codes: _Codes, factor: float, brief: bool) -> NDArray[np.int64]:
-        """Fill the maps, or of a brief answer those of `coordinates`; how many pixels have each reason."""
+    def _decode(self, brief: bool) -> tuple[NDArray[np.int64], float, tuple[str, ...]]:
+        """Fill the maps, or of a brief answer those of `coordinates`.
+
+        How many pixels have each reason, the noise's factor, and what a user should know.
+        """
+        codes = self._codes()
+        warnings, factor = self._check_complete(codes), self._noise_factor(codes)
         pattern, t = self._pattern, self._thresholds
         max_value = self._camera.max_value
         model = default_noise(max_value)
+        twice = np.empty(0, np.uint16 if codes.like.itemsize == 1 else np.uint32)
         arguments = (
-            codes.addresses, codes.kinds, codes.levels, codes.like, codes.coarse,
+            codes.addresses, codes.kinds, codes.levels, codes.like, twice, codes.coarse,
             max(int(np.ceil(t.saturation * max_value)), 1), pattern.code == "gray", pattern.code_bits - pattern.bits,
             np.array([self._sequence.projector.along(axis) for axis in pattern.axes]),
             np.array([model.read, model.per_level, ROUNDING_VARIANCE, factor], np.float32),
             np.array([t.min_contrast_levels, t.min_contrast_sigmas**2, t.decisive_share, t.decisive_sigmas**2,
                       1 - t.min_code_probability, t.max_open_cells, max_value], np.float32),
         )  # fmt: skip
+        share = share_to_count(self._reason.size // LINE)
 
         def decode(begin: int, end: int) -> NDArray[np.int64]:
-            counts = np.zeros(REASONS, np.int64)
-            decode_codes(*arguments, begin, end, brief, self._maps, self._reason, counts)
+            counts = np.zeros(REASONS + codes.kinds.size + 1, np.int64)
+            decode_codes(
+                *arguments, begin, end, brief, share, self._maps, self._reason, counts[:REASONS], counts[REASONS:]
+            )
             return counts
 
-        return np.asarray(np.sum(in_strips(decode, self._pixels, self._threads), axis=0))
+        counts = np.asarray(np.sum(in_strips(decode, self._pixels, self._threads), axis=0))
+        shares = shares_decided(counts[REASONS:], codes.kinds.shape)
+        return counts[:REASONS], factor, (*warnings, *blurred_bits(pattern, shares))
 
     def _by_axis(self) -> tuple[dict[Axis, Map], dict[Axis, Map], list[Map]]:
         """Positions and sigmas by axis; confidence, albedo and modulation."""
@@ -320,11 +282,6 @@ class GrayDecoder:
                 "noise_factor": factor,
             },
         )
-
-
-def _middle(values: NDArray[np.float32]) -> float:
-    # One of the two in the middle, where there are two: np.median takes their mean, and three times as long.
-    return float(nth_of(values, values.size // 2))
 
 
 def warm_up() -> None:

@@ -8,18 +8,15 @@ report can say what a coarse or empty scan comes from.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.graycode_kernels import BOTH_VARIANCE, SINGLE_VARIANCE, gather
-from scanner.decode.noise import NoiseModel
-from scanner.decode.runs import runs_of
 from scanner.patterns import GrayPattern
 
-SAMPLE = 2048
-"""Pixels from which is told how often a bit is decided: a share of a half is known to 1 %."""
+COUNTED_LINES = 1024
+"""Lines of pixels, spread over the image, whose decided bits are counted in the pass: a share of a half is known to 2 %
+even where all pixels of a line have the same bits."""
 
 LEAST_TOLD = 100
 """Pixels whose noise would decide every bit, fewer than which tell nothing of blur."""
@@ -29,44 +26,20 @@ LEAST_DECIDED = 0.5
 has a fifth of its contrast left."""
 
 
-def shares_decided(
-    addresses: NDArray[np.intp],
-    levels: NDArray[np.intp],
-    like: NDArray[Any],
-    pixels: int,
-    noise: NoiseModel,
-    factor: float,
-    share: float,
-    sigmas: float,
-) -> NDArray[np.float64]:
+def share_to_count(lines: int) -> int:
+    """What `decode_codes` takes as the share of an image's lines."""
+    return min(COUNTED_LINES * 2**32 // lines + 1, 2**32)
+
+
+def shares_decided(decided: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.float64]:
     """(A, bits) how often a bit is decided among bright pixels; NaN where there are too few of these.
 
     Args:
-        addresses, levels, like: see `decode_codes`. pixels: of a frame.
-        noise, factor: variance of a sample is the model's times the factor.
-        share: of a pixel's contrast, by which a bit's two levels must differ. sigmas: the same over noise; pixels at
-            which this asks for more than `share` are left out: their bits are open for another reason.
+        decided: (A x bits + 1,) at how many of them each bit is; at last how many there are.
     """
-    starts, length = runs_of(pixels, SAMPLE)
-    table = np.concatenate([addresses.reshape(-1), levels])
-    here = np.flatnonzero(table)
-    taken = np.empty((here.size, starts.size * length), like.dtype)
-    gather(table[here], like, starts, length, taken)
-    found = np.zeros((table.size, taken.shape[1]), np.float32)
-    found[here] = taken
-    images = found[:-2].reshape(*addresses.shape, -1)
-    single = (addresses == 0).any(axis=2)
-    white, black = (found[-2], found[-1]) if levels.all() else (images.max(axis=(0, 1, 2)), images.min(axis=(0, 1, 2)))
-    apart = np.abs(images[:, :, 0] - images[:, :, 1])
-    if single.any():
-        one = np.where(addresses[:, :, 0, None] != 0, images[:, :, 0], images[:, :, 1])
-        apart = np.where(single[:, :, None], np.abs(2 * one - white - black), apart)
-    contrast = white - black
-    variance = np.float32(factor) * noise.variance((white + black) * np.float32(0.5))
-    bright = share * contrast > sigmas * np.sqrt((SINGLE_VARIANCE if single.any() else BOTH_VARIANCE) * variance)
-    if np.count_nonzero(bright) < LEAST_TOLD:
-        return np.full(single.shape, np.nan)
-    return np.asarray((apart[:, :, bright] > share * contrast[bright]).mean(axis=2, dtype=np.float64))
+    if decided[-1] < LEAST_TOLD:
+        return np.full(shape, np.nan)
+    return np.asarray(decided[:-1].reshape(shape) / decided[-1], np.float64)
 
 
 def blurred_bits(pattern: GrayPattern, shares: NDArray[np.float64]) -> Iterator[str]:

@@ -13,47 +13,56 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.addresses import CACHE_LINE, aligned_rows, copies_of, keep, pixels_at
-from scanner.decode.graycode_bits import BOTH, levels_of_pairs, read_bits, value_and_spread
+from scanner.decode.addresses import aligned_rows, copies_of, keep
+from scanner.decode.graycode_bits import (
+    ADDING,
+    BOTH,
+    CELL,
+    NEAR,
+    NEAR_ONE,
+    NEAR_PAIR,
+    NEXT_ONE,
+    NEXT_PAIR,
+    OF_NEAR,
+    OF_WORDS,
+    ONES,
+    OPEN,
+    WEIGHTS,
+    count_decided,
+    read_bits,
+    sum_pairs,
+    value_and_spread,
+)
+from scanner.decode.graycode_light import BOTH_IMAGES, SINGLE, SURE2, find_bright, judge_light, light_and_dark
 from scanner.decode.reasons import count_reasons
 from scanner.kernel import contracting_kernel, inlined_kernel
-from scanner.lane_memory import stream
+from scanner.lane_memory import align_stack, stream
 from scanner.lanes import (
     LANES,
     Lanes,
     any_of,
     as_samples,
     choose,
-    expect,
     floats,
     greatest,
-    least,
     load,
     root,
     samples,
     store,
 )
-
-AHEAD = 512
-"""Pixels between the one that is worked on and the one that is asked for."""
+from scanner.sample_lanes import LINE, floats_at
 
 STRETCH = 16384
 """Pixels whose reasons are counted together."""
 
-BOTH_VARIANCE, SINGLE_VARIANCE = 2.0, 6.0
-"""Variance of an image less its inverse, and of twice an image less white and black, in units of one sample's."""
-
 _F0 = np.float32(0)
 _F1 = np.float32(1)
 _HALF = np.float32(0.5)
+_GOLDEN = 2654435769
+_WORD = 0xFFFFFFFF
+"""2^32 over the golden ratio; its multiples without what is beyond 32 bits lie evenly spread among these."""
 _NAN = np.float32(np.nan)
-_BOTH = np.float32(BOTH_VARIANCE)
-_SINGLE = np.float32(SINGLE_VARIANCE)
 _ROOT12 = np.float32(12**0.5)
-
-_SURE2 = np.float32(6**2)
-"""Square of the sigmas from which a bit is certain: 1e-9 of being wrong, times sixteen bits, is nothing beside 1 in
-float32."""
 
 # erfc(x) = 1 / (1 + a1 x + ... + a6 x^6)^16, error below 3e-7 (Abramowitz and Stegun 1964, 7.1.28); x = z / sqrt(2).
 _S1 = np.float32(0.0705230784 / 2**0.5)
@@ -70,6 +79,7 @@ def decode_codes(
     kinds: NDArray[np.int64],
     levels: NDArray[np.intp],
     like: NDArray[Any],
+    twice: NDArray[Any],
     coarse: int,
     clip: int,
     gray: bool,
@@ -80,16 +90,18 @@ def decode_codes(
     begin: int,
     end: int,
     brief: bool,
+    share: int,
     maps: NDArray[np.float32],
     reason: NDArray[np.uint8],
     counts: NDArray[np.int64],
+    decided: NDArray[np.int64],
 ) -> None:
-    """Decode pixels begin .. end - 1; begin is a multiple of LANES.
+    """Decode pixels begin .. end - 1; begin is a multiple of LINE.
 
     Args:
         addresses: (A, bits, 2) of each axis's images and their inverses, most significant bit first; 0 where `kinds`
             says that there is none. kinds: (A, bits) PLAIN, INVERSE or BOTH. levels: (2,) of white and black, or zeros.
-        like: (0,) array of the frames' dtype, uint8 or uint16.
+        like: (0,) array of the frames' dtype, uint8 or uint16. twice: (0,) of unsigned numbers of twice as many bits.
         coarse: bits of each axis whose pairs stand in for white and black where there are none.
         clip: grey level from which a sample counts as saturated.
         gray: Gray code, else binary. shift: code bits that were not projected. sizes: (A,) projector pixels an axis.
@@ -97,43 +109,52 @@ def decode_codes(
         limits: [contrast in levels, contrast in sigmas squared, decisive share of the contrast, decisive sigmas
             squared, wrong-bit probability, cells from the first to the last that open bits leave, largest grey level].
         brief: write positions, confidence and reason alone.
-        maps: (2 A + 3, P + up to LANES) float32 whose rows begin with a cache line; positions, sigmas, confidence,
-            albedo, modulation. reason: (P + up to LANES,) uint8. Both are written up to a multiple of LANES.
-        counts: (9,) int64, how many pixels have each reason, is added to.
+        share: of all lines of pixels times 2^32, those whose decided bits are counted.
+        maps: (2 A + 3, P + up to LINE) float32 whose rows begin with a cache line; positions, sigmas, confidence,
+            albedo, modulation. reason: (P + up to LINE,) uint8. Both are written up to a multiple of LINE.
+        counts: (9,) int64, how many pixels have each reason, is added to. decided: see `count_decided`.
     """
-    table, flat, stride = addresses.reshape(-1), maps.reshape(-1), maps.shape[1]
-    spot = aligned_rows(2 * kinds.shape[0], LANES).reshape(-1)
-    pairs = np.zeros(kinds.shape[0], np.int64)
-    for axis in range(kinds.shape[0]):
+    align_stack()
+    table, flat, stride, axes = addresses.reshape(-1), maps.reshape(-1), maps.shape[1], kinds.shape[0]
+    spot = aligned_rows(2 * axes, LANES).reshape(-1)
+    lines = aligned_rows(NEAR + axes * OF_NEAR, LINE).reshape(-1).view(like.dtype)
+    sums, words = aligned_rows(2, LINE).reshape(-1).view(twice.dtype), np.empty(axes * OF_WORDS * LINE, np.uint16)
+    lines[ONES * LINE : (ONES + 1) * LINE] = 1
+    lines[ADDING * LINE : (ADDING + 1) * LINE] = 1 if gray else 0
+    for bit in range(kinds.shape[1]):
+        weight = 1 << ((kinds.shape[1] - 1 - bit) % (8 * like.itemsize))
+        lines[(WEIGHTS + bit) * LINE : (WEIGHTS + bit + 1) * LINE] = weight
+    near = np.array([lines.ctypes.data, words.ctypes.data, reason.ctypes.data])
+    pairs = np.zeros(axes + 1, np.int64)
+    for axis in range(axes):
         for bit in range(kinds.shape[1]):
             pairs[axis] += 1 if kinds[axis, bit] == BOTH else 0
-    line, solid = CACHE_LINE // like.itemsize, end // LANES * LANES
-    for at in range(begin, solid, LANES):
-        if at % line == 0:
-            for n in range(table.size):
-                # One that is not there has address 0, and asking for it does no harm.
-                expect(table, n, at + AHEAD, like)
-        _decode_lanes(
-            addresses, kinds, pairs, levels, like, coarse, clip, gray, shift, sizes, noise, limits, brief,
-            at, stride, spot, flat, reason,
+        pairs[axes] += pairs[axis]
+    solid = end // LINE * LINE
+    for at in range(begin, solid, LINE):
+        _decode_line(
+            addresses, kinds, pairs, levels, like, coarse, clip, gray, shift, sizes, noise, limits, brief, share,
+            at, stride, spot, lines, sums, words, near, flat, reason, decided,
         )  # fmt: skip
     if solid < end:
-        # What is left goes into vectors of its own: nothing may be read beyond a frame's last pixel.
-        spare, spare_levels = np.zeros((table.size, LANES), like.dtype), np.zeros((2, LANES), like.dtype)
-        near = copies_of(table, solid, end - solid, like, spare)
+        # What is left goes into lines of its own: nothing may be read beyond a frame's last pixel.
+        spare, spare_levels = np.zeros((table.size, LINE), like.dtype), np.zeros((2, LINE), like.dtype)
+        last = copies_of(table, solid, end - solid, like, spare)
         of_levels = copies_of(levels, solid, end - solid, like, spare_levels)
-        _decode_lanes(
-            near.reshape(addresses.shape), kinds, pairs, of_levels, like, coarse, clip, gray, shift, sizes, noise,
-            limits, brief, solid, stride, spot, flat, reason,
+        _decode_line(
+            last.reshape(addresses.shape), kinds, pairs, of_levels, like, coarse, clip, gray, shift, sizes, noise,
+            limits, brief, share, solid, stride, spot, lines, sums, words, near, flat, reason, decided,
         )  # fmt: skip
         keep(spare)
         keep(spare_levels)
+    # Mentioned once more: see `copies_of`.
+    lines[0], words[0] = 0, 0
     for at in range(begin, end, STRETCH):
         count_reasons(reason[at : min(at + STRETCH, end)], counts)
 
 
 @inlined_kernel
-def _decode_lanes(
+def _decode_line(
     addresses: NDArray[np.intp],
     kinds: NDArray[np.int64],
     pairs: NDArray[np.int64],
@@ -147,62 +168,144 @@ def _decode_lanes(
     noise: NDArray[np.float32],
     limits: NDArray[np.float32],
     brief: bool,
+    share: int,
     at: int,
     stride: int,
     spot: NDArray[np.float32],
+    lines: NDArray[Any],
+    sums: NDArray[Any],
+    words: NDArray[np.uint16],
+    near: NDArray[np.intp],
+    maps: NDArray[np.float32],
+    reason: NDArray[np.uint8],
+    decided: NDArray[np.int64],
+) -> None:
+    """Decode LINE pixels from `at` on.
+
+    Args:
+        pairs: (A + 1,) how many bits of each axis, and of all, have both images.
+        maps: flat, rows of `stride`. spot: (2 A x LANES,), to work in. lines, sums, words: rows to work in; see
+            `graycode_bits`. near: (3,) where lines, words and reason lie.
+    """
+    axes, bits, top = kinds.shape[0], kinds.shape[1], int(limits[6])
+    has_pairs, has_single = bool(pairs[axes] > 0), bool(pairs[axes] < axes * bits)
+    if levels[0] == 0:
+        sum_pairs(addresses, coarse, at, like, lines, sums)
+    margins, opened = False, False
+    for half in range(0, LINE, LANES):
+        margins |= judge_light(
+            has_pairs, has_single, levels, like, axes * coarse, clip, noise, limits, at, half, lines, sums, reason
+        )
+    for axis in range(axes):
+        # Whether all are pairs and margins are kept is known when each of these is compiled.
+        if margins:
+            opened |= read_bits(addresses, kinds, levels, axis, at, like, top, False, True, lines, words)
+        elif has_single:
+            opened |= read_bits(addresses, kinds, levels, axis, at, like, top, False, False, lines, words)
+        else:
+            opened |= read_bits(addresses, kinds, levels, axis, at, like, top, True, False, lines, words)
+    # Places that fall into no step with the image's width.
+    if at // LINE * _GOLDEN & _WORD < share:
+        for half in range(0, LINE, LANES):
+            find_bright(has_single, levels, like, axes * coarse, noise, limits, at, half, lines, sums)
+        count_decided(addresses, kinds, levels, at, like, top, lines, decided)
+    for half in range(0, LINE, LANES):
+        if margins or opened:
+            _judge_words(
+                kinds, pairs, levels, like, axes * coarse, gray, shift, sizes, noise, limits, brief, margins, True,
+                at, half, stride, spot, lines, sums, words, near, maps, reason,
+            )  # fmt: skip
+        else:
+            _judge_words(
+                kinds, pairs, levels, like, axes * coarse, gray, shift, sizes, noise, limits, brief, margins, False,
+                at, half, stride, spot, lines, sums, words, near, maps, reason,
+            )  # fmt: skip
+
+
+@inlined_kernel
+def _judge_words(
+    kinds: NDArray[np.int64],
+    pairs: NDArray[np.int64],
+    levels: NDArray[np.intp],
+    like: NDArray[Any],
+    summed: int,
+    gray: bool,
+    shift: int,
+    sizes: NDArray[np.int64],
+    noise: NDArray[np.float32],
+    limits: NDArray[np.float32],
+    brief: bool,
+    margins: bool,
+    unsure: bool,
+    at: int,
+    half: int,
+    stride: int,
+    spot: NDArray[np.float32],
+    lines: NDArray[Any],
+    sums: NDArray[Any],
+    words: NDArray[np.uint16],
+    near: NDArray[np.intp],
     maps: NDArray[np.float32],
     reason: NDArray[np.uint8],
 ) -> None:
-    """Decode LANES pixels from `at` on. maps: flat, rows of `stride`. spot: (2 A x LANES,), to work in."""
+    """Positions of LANES pixels from the bits that were read. unsure: some of them are open, or near the limit."""
     axes, bits = kinds.shape
-    v0, slope, least_variance, factor = noise[0], noise[1], noise[2], noise[3]
-    top, step = limits[6], np.float32(1 << shift)
-    if levels[0] != 0:
-        light, dark = floats(samples(levels, 0, at, like)), floats(samples(levels, 1, at, like))
-    else:
-        light, dark = levels_of_pairs(addresses, coarse, at, like)
-    contrast, middle = light - dark, _HALF * (light + dark)
-    variance = factor * greatest(v0 + slope * middle, least_variance)
-    enough = (contrast > limits[0]) & (contrast * contrast > limits[1] * variance)
-    late = _F0 if levels[0] != 0 else _HALF
-    why = choose(dark >= np.float32(clip) - late, 2, choose(enough, 0, 1))
-    # |d| > t for whole |d| is |d| > floor(t).
-    share = greatest(limits[2] * contrast, _F0)
-    of_pairs = as_samples(least(greatest(share, root(limits[3] * _BOTH * variance)), top), like)
-    of_one = as_samples(least(greatest(share, root(limits[3] * _SINGLE * variance)), top), like)
-    kept = floats(_F1)
+    step, top = np.float32(1 << shift), limits[6]
+    variance, contrast, middle = floats(_F0), floats(_F0), floats(_F0)
+    if (unsure and margins) or not brief:
+        light, dark = light_and_dark(levels, like, summed, at, half, sums)
+        contrast, middle = light - dark, _HALF * (light + dark)
+        variance = noise[3] * greatest(noise[0] + noise[1] * middle, noise[2])
+    why, kept = samples(near, 2, at + half, reason), floats(_F1)
     for axis in range(axes):
-        code, unsure, near_pair, next_pair, near_one, next_one = read_bits(
-            addresses, kinds, levels, axis, at, like, of_pairs, of_one, int(top)
-        )
-        value, spread = value_and_spread(code, unsure, gray)
-        wrong = floats(_F0)
-        if pairs[axis] > 0:
-            wrong += _doubt(near_pair, next_pair, pairs[axis], _BOTH * variance, top)
-        if pairs[axis] < bits:
-            wrong += _doubt(near_one, next_one, bits - pairs[axis], _SINGLE * variance, top)
-        # Open bits do no harm where all they could mean names cells close by: a border of cells, or blur.
-        odds = choose(spread <= limits[5], wrong, _F1)
-        kept *= greatest(_F1 - odds, _F0)
-        of_axis = choose(odds > limits[4], 4, choose(value * step >= np.float32(sizes[axis]), 5, 0))
-        why = choose(why > 0, why, of_axis)
+        place = axis * OF_WORDS * LINE + half
+        if unsure:
+            value, spread = value_and_spread(
+                samples(near, 1, place + CELL * LINE, words), samples(near, 1, place + OPEN * LINE, words), gray
+            )
+            wrong = floats(_F0)
+            if margins:
+                first = (NEAR + axis * OF_NEAR) * LINE + half
+                if pairs[axis] > 0:
+                    least_pair, next_pair = (
+                        floats_at(lines, first + NEAR_PAIR * LINE),
+                        floats_at(lines, first + NEXT_PAIR * LINE),
+                    )
+                    wrong += _doubt(least_pair, next_pair, pairs[axis], BOTH_IMAGES * variance, top)
+                if pairs[axis] < bits:
+                    least_one, next_one = (
+                        floats_at(lines, first + NEAR_ONE * LINE),
+                        floats_at(lines, first + NEXT_ONE * LINE),
+                    )
+                    wrong += _doubt(least_one, next_one, bits - pairs[axis], SINGLE * variance, top)
+            # Open bits do no harm where all they could mean names cells close by: a border of cells, or blur.
+            odds = choose(spread <= limits[5], wrong, _F1)
+            kept *= greatest(_F1 - odds, _F0)
+            why = choose(why > 0, why, choose(odds > limits[4], as_samples(4, reason), 0))
+            if not brief:
+                store(spot, (axes + axis) * LANES, (spread + _F1) * (step / _ROOT12))
+        else:
+            value = floats_at(words, place + CELL * LINE)
+        why = choose(why > 0, why, choose(value * step >= np.float32(sizes[axis]), as_samples(5, reason), 0))
         store(spot, axis * LANES, (value + _HALF) * step - _HALF)
-        store(spot, (axes + axis) * LANES, (spread + _F1) * (step / _ROOT12))
-    good = why < 1
-    for row in range(axes if brief else 2 * axes):
-        stream(maps, row * stride + at, choose(good, load(spot, row * LANES), _NAN))
-    stream(maps, 2 * axes * stride + at, choose(good, kept, _F0))
+    good, place = why < 1, at + half
+    for row in range(axes):
+        stream(maps, row * stride + place, choose(good, load(spot, row * LANES), _NAN))
+    stream(maps, 2 * axes * stride + place, choose(good, kept, _F0))
     if not brief:
-        stream(maps, (2 * axes + 1) * stride + at, middle)
-        stream(maps, (2 * axes + 2) * stride + at, _HALF * contrast)
-    store(reason, at, why)
+        for row in range(axes, 2 * axes):
+            sigma = load(spot, row * LANES) if unsure else floats(step / _ROOT12)
+            stream(maps, row * stride + place, choose(good, sigma, _NAN))
+        stream(maps, (2 * axes + 1) * stride + place, middle)
+        stream(maps, (2 * axes + 2) * stride + place, _HALF * contrast)
+    store(reason, place, why)
 
 
 @inlined_kernel
 def _doubt(near: Lanes, after: Lanes, count: int, variance: Lanes, top: np.float32) -> Lanes:
     """Probability that one of `count` decided bits is wrong: the least certain, and all others as the next."""
     first, second, wrong = floats(near), floats(after), floats(_F0)
-    if any_of((first < top) & (first * first < _SURE2 * variance)):
+    if any_of((first < top) & (first * first < SURE2 * variance)):
         scale = _F1 / root(variance)
         wrong = choose(first < top, _tail(first * scale), _F0)
         wrong += np.float32(count - 1) * choose(second < top, _tail(second * scale), _F0)
@@ -217,15 +320,3 @@ def _tail(z: Lanes) -> Lanes:
     s = s * s
     s = s * s
     return _HALF / (s * s)
-
-
-@contracting_kernel
-def gather(
-    addresses: NDArray[np.intp], like: NDArray[Any], starts: NDArray[np.intp], length: int, out: NDArray[Any]
-) -> None:
-    """Copy runs of `length` pixels from `starts` on of frames into out: (F, R x length) of the frames' dtype."""
-    for f in range(addresses.size):
-        for r in range(starts.size):
-            run = pixels_at(addresses[f], starts[r], length, like)
-            for i in range(length):
-                out[f, r * length + i] = run[i]

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from scanner.decode import Reason, decoder_for
 from scanner.decode.graycode import GrayDecoder
+from scanner.decode.noise import default_noise
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, PmpPattern, ProjectorSize
 
@@ -190,6 +191,38 @@ def test_what_blur_leaves_of_the_code_is_coarse_undecided_and_said(code, sigma_p
         assert found.warnings[0].startswith("out of focus")
         assert finest in found.warnings[0]
         assert f"--bits {9 - gone}" in found.warnings[0]
+
+
+def plain_noise_factor(sequence, frames, white, black, model):
+    """What the first axis's coarse images say of noise, of all pixels of a small capture: squares within 3 sigmas."""
+    bits, each = sequence.pattern.bits, sequence.pattern.frames_per_bit
+    expected = model.variance(((white + black) / 2).astype(np.float32))
+    ratios = []
+    for bit in range((bits + 1) // 2):
+        images = [frames[sequence.fringes[bit * each + n]].astype(float) for n in range(each)]
+        if each == 2:
+            terms = 3 if sequence.white is None else 4
+            ratios.append((sum(images) - white - black) ** 2 / (terms * expected))
+        else:
+            nearest = np.minimum(np.abs(images[0] - white), np.abs(images[0] - black))
+            ratios.append(nearest**2 / (2 * expected))
+    ratios = np.array(ratios)
+    within = ratios <= 9 * max(np.median(ratios) / 0.455, np.median(1 / 12 / expected))
+    return ratios[within].mean() / 0.973
+
+
+@pytest.mark.parametrize(("inverse", "levels"), [(True, False), (True, True), (False, True)])
+def test_noise_is_that_of_the_plain_form(inverse, levels):
+    camera = CameraFormat(64, 60)
+    sequence = sequence_of(GrayPattern(("x", "y"), 8, 9, inverse=inverse), levels)
+    frames = dict(take(sequence, camera, noise=0.01))
+    if levels:
+        white, black = frames[sequence.white].astype(float), frames[sequence.black].astype(float)
+    else:
+        pairs = np.array([frames[p] for p in sequence.fringes[:8]], float).reshape(4, 2, *camera.shape)
+        white, black = pairs.max(axis=1).mean(axis=0), pairs.min(axis=1).mean(axis=0)
+    expected = plain_noise_factor(sequence, frames, white, black, default_noise(255))
+    assert decode(sequence, frames.items(), camera).details["noise_factor"] == pytest.approx(expected, rel=1e-3)
 
 
 def test_pixels_too_dim_to_tell_accuse_no_blur():
