@@ -28,8 +28,11 @@ from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, PmpPatt
 
 PROJECTOR = ProjectorSize(1152, 864)
 STACKS = 4
-OURS_AROUND = 3
-"""Runs of ours to one of another's."""
+BLOCKS = 5
+"""Of another's runs and of ours, in turns."""
+SETTLING = 0.1
+"""Seconds of a block that are not counted: the threads of NumPy's BLAS go on looking for work for a quarter of it, and
+take a processor from whoever runs next."""
 
 
 def main():
@@ -123,8 +126,8 @@ def coordinates_time(decoder, frames):
 def measure_others(sequence, camera, stacks, runs):
     """Print what others need for the same frames; one thread is theirs to choose.
 
-    Theirs and ours run in turns. Each ratio is that of one run of theirs to the median of the three of ours around it;
-    what is told is their median, what half of them lie between, and the ratio of the least times.
+    Theirs and ours run in blocks that take turns. Each ratio is that of the medians of two blocks side by side; what is
+    told is their median, the least and greatest of them, and the ratio of the least times.
     """
     others = {"OpenCV and NumPy": lambda frames: plain_decode(sequence.pattern, frames)}
     if importlib.util.find_spec("fringes") is not None:
@@ -134,24 +137,36 @@ def measure_others(sequence, camera, stacks, runs):
     else:
         print("fringes is not installed: no comparison with it")
     for name, decode in others.items():
-        decode(stacks[0])
         times, ours, ratios = [], [], []
-        for run in range(runs):
-            around = []
-            for turn in range(OURS_AROUND):
-                if turn == OURS_AROUND // 2:
-                    begin = time.perf_counter()
-                    decode(stacks[run % STACKS])
-                    times.append(time.perf_counter() - begin)
-                decoder = pmp.PmpDecoder(sequence, camera)
-                around.append(coordinates_time(decoder, stacks[(run + turn + 1) % STACKS]))
-            ours += around
-            ratios.append(times[-1] / np.median(around))
-        low, middle, high = np.percentile(ratios, (25, 50, 75))
+        for _ in range(BLOCKS):
+            times.append(
+                block_of(lambda frames, decode=decode: time_of(decode, frames), stacks, max(2, runs // BLOCKS))
+            )
+            ours.append(
+                block_of(lambda frames: coordinates_time(pmp.PmpDecoder(sequence, camera), frames), stacks, runs)
+            )
+            ratios.append(np.median(times[-1]) / np.median(ours[-1]))
         print(
-            f"{name:30s}{1e3 * np.median(times):8.1f} ({1e3 * min(times):.1f})   {middle:5.1f} x ours "
-            f"({low:.1f} to {high:.1f}; least times {min(times) / min(ours):.1f})"
+            f"{name:30s}{1e3 * np.median(times):8.1f} ({1e3 * np.min(times):.1f})   {np.median(ratios):5.1f} x ours, "
+            f"{1e3 * np.median(ours):.2f} ({min(ratios):.1f} to {max(ratios):.1f}; "
+            f"least times {np.min(times) / np.min(ours):.1f})"
         )
+
+
+def block_of(seconds_of, stacks, runs):
+    """(runs,) seconds of runs one after the other, on stacks in rotation, after SETTLING."""
+    begin, run = time.perf_counter(), 0
+    while run == 0 or time.perf_counter() - begin < SETTLING:
+        seconds_of(stacks[run % STACKS])
+        run += 1
+    return [seconds_of(stacks[run % STACKS]) for run in range(runs)]
+
+
+def time_of(decode, frames):
+    """Seconds of a decode by others."""
+    begin = time.perf_counter()
+    decode(frames)
+    return time.perf_counter() - begin
 
 
 def coordinates_of(sequence, camera, frames):
