@@ -1,6 +1,6 @@
 """How noisy a grey level is: shot and read noise as variance = read + per_level x level, in grey levels.
 
-Estimated from what repeated or redundant frames leave (`fit_noise`), and a cautious default for captures that leave
+Estimated from what repeated or redundant frames leave (`fit_line`), and a cautious default for captures that leave
 nothing. This file does not know where the residuals come from.
 """
 
@@ -54,27 +54,20 @@ def default_noise(max_value: int) -> NoiseModel:
     return NoiseModel((DEFAULT_READ_SHARE * max_value) ** 2, max_value / DEFAULT_FULL_WELL_E, measured=False)
 
 
-def fit_noise(level: NDArray[np.float32], squares: NDArray[np.float32], freedom: int, max_value: int) -> NoiseModel:
-    """The model that fits the residuals of this capture.
+@kernel
+def fit_line(level: NDArray[np.float32], squares: NDArray[np.float32], freedom: int) -> tuple[float, float]:
+    """Variance at level 0, and per level, that fit the residuals of a capture.
 
     Args:
-        level: (n,) float32 mean grey level. squares: (n,) float32 sum of squared residuals.
-        freedom: degrees of freedom of each sum. max_value: largest grey level of the camera.
+        level: (n,) float32 mean grey level, n >= FEWEST. squares: (n,) float32 sum of squared residuals.
+        freedom: degrees of freedom of each sum, 1 or more.
 
     Medians in bins of equal count stand against pixels that moved or are mixed; the median of a chi-square variable of
-    k degrees is k (1 - 2 / (9 k))^3 (Wilson and Hilferty 1931). Under 100 samples, or no freedom, give the default.
+    k degrees is k (1 - 2 / (9 k))^3 (Wilson and Hilferty 1931).
 
     Grey levels end at 0, and noise of pixels as dark as it is high is cut off there: those say nothing of it, and are
     left out where there are others (see CUT_SIGMAS).
     """
-    if freedom < 1 or level.size < FEWEST:
-        return default_noise(max_value)
-    return NoiseModel(*fit_line(level, squares, freedom), measured=True)
-
-
-@kernel
-def fit_line(level: NDArray[np.float32], squares: NDArray[np.float32], freedom: int) -> tuple[float, float]:
-    """Variance at level 0, and per level, of FEWEST or more samples: see `fit_noise`."""
     return fit_line_in_order(order_of(level), level, squares, freedom)
 
 

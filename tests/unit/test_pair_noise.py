@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scanner.decode.agreement import remainders_of
-from scanner.decode.noise import NoiseModel, default_noise, fit_noise
+from scanner.decode.noise import NoiseModel, default_noise, fit_line
 from scanner.decode.pair_noise import PAIR_DISTANCE, UNFOLDED_SIGMA, noise_of_pairs
 from scanner.decode.pmp_plan import plan_axis, whole_sets
 from scanner.patterns import PmpPattern
@@ -36,7 +36,8 @@ def plain(phases, modulations, mean, good):
     level = np.broadcast_to(sum(mean[:, at][pair] for at in ends) / 2, apart.shape)
     for _ in range(3):
         use = per_sample * model.variance(level) < UNFOLDED_SIGMA**2
-        model = fit_noise(level[use], (apart[use] ** 2 / per_sample[use]).astype(np.float32), 1, 255)
+        squares = (apart[use] ** 2 / per_sample[use]).astype(np.float32)
+        model = NoiseModel(*fit_line(level[use], squares, 1), measured=True)
     return model
 
 

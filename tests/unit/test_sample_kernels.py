@@ -7,7 +7,7 @@ import pytest
 
 from scanner.decode.agreement import folded_medians, remainders, remainders_of
 from scanner.decode.middles import middle_of_squares, middles_of_bins, nth_of, order_of
-from scanner.decode.noise import fit_noise
+from scanner.decode.noise import default_noise, fit_line
 from scanner.decode.pmp_plan import plan_axis, whole_sets
 from scanner.decode.pmp_sample import Sample
 from scanner.decode.sample_kernels import BINS, MIN_PIXELS, judge_steps, mean_of_good
@@ -81,8 +81,9 @@ def test_a_sample_is_judged_as_in_the_plain_form():
     pattern = PmpPattern(("y",), (1.0, 8.0, 64.0), (8, 8, 8))
     judged = drawn.judged(plan_axis(pattern, 500, whole_sets(pattern)), least, sigmas, 0.001)
     noise = judged.noise
-    alone = fit_noise(drawn.mean[drawn.usable], drawn.residual[drawn.usable], drawn.freedom, 255)
-    assert [noise.read, noise.per_level] == pytest.approx([alone.read, alone.per_level])
+    alone = fit_line(drawn.mean[drawn.usable], drawn.residual[drawn.usable], drawn.freedom)
+    assert noise.measured
+    assert [noise.read, noise.per_level] == pytest.approx(alone)
 
     model = noise.variance(drawn.mean)
     own = (np.float32(drawn.prior) * model + drawn.residual) / np.float32(drawn.prior + drawn.freedom)
@@ -100,6 +101,12 @@ def test_a_sample_is_judged_as_in_the_plain_form():
     steps = np.empty((2, 4))
     judge(plan_ladder(pattern.frequencies, [0.25] * 3), drawn.phases[:, good], judged.cycles2, steps, 0.001)
     assert np.allclose(judged.steps, steps, rtol=1e-4, atol=1e-6)
+
+
+def test_little_evidence_leaves_the_default_noise():
+    pattern = PmpPattern(("y",), (1.0, 8.0, 64.0), (8, 8, 8))
+    judged = sample(64).judged(plan_axis(pattern, 500, whole_sets(pattern)), 3.0, 7.0, 0.001)
+    assert judged.noise == default_noise(255)
 
 
 def judge(ladder, phases, cycles2, steps, floor=0.0):
