@@ -95,7 +95,7 @@ class GrayDecoder:
         threads: that share the pass over the pixels; as `threads_to_use` says if None.
 
     Raises:
-        DecodeError: neither inverses, nor white and black.
+        DecodeError: neither inverses, nor white and black; or the code has fewer words than the projector has pixels.
     """
 
     def __init__(
@@ -107,6 +107,7 @@ class GrayDecoder:
     ) -> None:
         if not isinstance(sequence.pattern, GrayPattern):
             raise DecodeError(f"a Gray code decoder cannot decode method {sequence.pattern.method!r}")
+        sequence.pattern.validate(sequence.projector)
         if not sequence.pattern.inverse and (sequence.white is None or sequence.black is None):
             raise DecodeError(
                 "Gray code without inverses needs a white and a black frame",

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Reason
+from scanner.decode.field_end import FieldEnd, heights_of, mind_ends
 from scanner.decode.frames import FrameCheck
 from scanner.decode.graycode import GrayDecoder, GrayThresholds
 from scanner.decode.phase_and_code import PhaseAndCode, compare_phase_and_code, require_code_order
@@ -31,6 +32,9 @@ MOST_APART = 0.42
 """Of a fringe, between the places of phase and code: beyond, the next fringe is nearly as likely. Over the cells
 themselves, of half a fringe, it is a quarter at most."""
 
+FEWEST_BITS = 4
+"""Of a code, whose coarse half then tells the contrast of white and black"""
+
 
 class GrayPmpDecoder:
     """A `scanner.decode.Decoder` for one Gray + PMP capture.
@@ -39,11 +43,15 @@ class GrayPmpDecoder:
         sequence: what was projected; its pattern is a `GrayPmpPattern`.
         camera: the frames' format.
         threads: that share the pass over the pixels; as `threads_to_use` says if None.
+
+    Raises:
+        DecodeError: the code has fewer words than the projector has pixels.
     """
 
     def __init__(self, sequence: PatternSequence, camera: CameraFormat, threads: int | None = None) -> None:
         if not isinstance(sequence.pattern, GrayPmpPattern):
             raise DecodeError(f"a Gray + PMP decoder cannot decode method {sequence.pattern.method!r}")
+        sequence.pattern.gray.validate(sequence.projector)
         self._sequence, self._pattern, self._camera = sequence, sequence.pattern, camera
         self._threads = threads or threads_to_use()
         self._check = FrameCheck(sequence, camera)
@@ -70,6 +78,7 @@ class GrayPmpDecoder:
         code = self._code(next(iter(found.values())).maps)
         warnings = list(code.warnings)
         agreement: dict[Axis, PhaseAndCode] = {}
+        ends: dict[Axis, FieldEnd | None] = {}
         for axis, of_axis in found.items():
             cells = code.rows if axis == "y" else code.columns
             if cells is None:
@@ -90,13 +99,25 @@ class GrayPmpDecoder:
                 m.position, m.sigma, m.confidence, m.reason, cells.reshape(-1), code.confidence.reshape(-1),
                 code.reason.reshape(-1), np.float32(period), np.float32(along), np.float32(MOST_APART),
             )  # fmt: skip
+            counts = np.bincount(m.reason, minlength=REASONS)
+            ends[axis] = end = self._mind_ends(of_axis, along, code, counts)
+            warnings += filter(None, [None if end is None else end.warning(axis)])
             if (changes := of_axis.light.flicker) is not None:
                 warnings += filter(None, [changes.warning(axis, of_axis.random_px)])
         first, *other = [f.maps for f in found.values()]
         if other:
-            first.join(other[0])
-        counts = np.bincount(first.reason, minlength=REASONS)
-        return self._decoded(found, agreement, first, code, counts, tuple(warnings))
+            counts = first.join(other[0])
+        return self._decoded(found, agreement, ends, first, code, counts, tuple(warnings))
+
+    def _mind_ends(self, found: AxisFound, along: int, code: Decoded, counts: NDArray[np.int64]) -> FieldEnd | None:
+        """What ends of the field did to an axis's maps, whose blur the code's contrast tells beside the fringes'."""
+        gray, sequence, m = self._pattern.gray, self._sequence, found.maps
+        levels = sequence.white is not None and sequence.black is not None
+        contrast = code.modulation.reshape(-1) if gray.inverse or levels or gray.bits >= FEWEST_BITS else None
+        return mind_ends(
+            m.position, m.sigma, m.confidence, m.reason, self._camera.width, along,
+            lambda: heights_of(self._pattern.pmp, along, found.sample, contrast), counts,
+        )  # fmt: skip
 
     def _require_fringes(self) -> None:
         lost: list[int] = []
@@ -157,7 +178,7 @@ class GrayPmpDecoder:
         the coarse half of an axis's bits one at most is on a border here, which the middle one leaves out.
         """
         axes, bits = len(self._pattern.axes), self._pattern.gray.bits
-        if len(code) != axes * bits or bits < 4:
+        if len(code) != axes * bits or bits < FEWEST_BITS:
             return light.modulation
         coarse = np.stack([frame.reshape(-1) for frame in code[: (bits + 1) // 2]]).astype(np.float32)
         apart = np.abs(coarse - light.albedo)
@@ -168,6 +189,7 @@ class GrayPmpDecoder:
         self,
         found: dict[Axis, AxisFound],
         agreement: dict[Axis, PhaseAndCode],
+        ends: dict[Axis, FieldEnd | None],
         maps: AxisMaps,
         code: Decoded,
         counts: NDArray[np.int64],
@@ -178,6 +200,7 @@ class GrayPmpDecoder:
             "counts": {r.name.lower(): int(counts[r]) for r in Reason if counts[r]},
             "noise": asdict(next(iter(found.values())).noise),
             "light": {axis: f.light.as_dict() for axis, f in found.items()},
+            "field_end": {axis: end.as_dict() for axis, end in ends.items() if end is not None},
             "phase_and_code": {axis: a.as_dict() for axis, a in agreement.items()},
             "code": {key: code.details[key] for key in ("counts", "thresholds", "noise_factor")},
         }

@@ -17,9 +17,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode import Coordinates, Decoded, Reason, addresses, neighbours, one_surface, pair_noise, spectra
+from scanner.decode import (
+    Coordinates,
+    Decoded,
+    Reason,
+    addresses,
+    field_end,
+    neighbours,
+    one_surface,
+    pair_noise,
+    spectra,
+)
 from scanner.decode.agreement import disagreements, doubtful_counts
 from scanner.decode.doubled import doubled_frames
+from scanner.decode.field_end import FieldEnd, heights_of, mind_ends
 from scanner.decode.frames import FrameCheck
 from scanner.decode.lone_set import require_fringes
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps
@@ -67,6 +78,7 @@ class PmpDecoder:
         self._copies: NDArray[Any] | None = None
         self._maps = {axis: AxisMaps.empty(camera.width * camera.height) for axis in self._pattern.axes}
         self._found: dict[Axis, AxisFound] = {}
+        self._ends: dict[Axis, FieldEnd | None] = {}
         self._doubled: list[str] = []
 
     @property
@@ -116,6 +128,8 @@ class PmpDecoder:
                 warnings += tuple(filter(None, [changes.warning(axis, found.random_px)]))
             if found.ripple is not None and (ripple := found.ripple.warning(axis, found.light)) is not None:
                 warnings += (ripple,)
+            if (end := self._ends[axis]) is not None:
+                warnings += tuple(filter(None, [end.warning(axis)]))
         warnings += self._found[self._pattern.axes[0]].ladder.warnings()
         return self._decoded((*self._doubled, *warnings))
 
@@ -191,10 +205,15 @@ class PmpDecoder:
 
     def _decoded_axis(self, axis: Axis, brief: bool) -> AxisFound:
         frames = axis_frames(self._pattern, axis, self._frames)
-        return decode_axis(
-            self._pattern, self._sequence.projector.along(axis), self._camera, frames,
-            self._maps[axis], self._thresholds, self._threads, brief=brief,
+        along, maps = self._sequence.projector.along(axis), self._maps[axis]
+        found = decode_axis(
+            self._pattern, along, self._camera, frames, maps, self._thresholds, self._threads, brief=brief
+        )
+        self._ends[axis] = mind_ends(
+            maps.position, maps.sigma[: 0 if brief else None], maps.confidence, maps.reason, self._camera.width, along,
+            lambda: heights_of(self._pattern, along, found.sample), found.counts,
         )  # fmt: skip
+        return found
 
     def _require_fringes(self, axis: Axis, found: AxisFound) -> None:
         if len(self._pattern.frequencies) == 1:
@@ -230,6 +249,7 @@ class PmpDecoder:
                 for axis, found in self._found.items()
             },
             "light": {axis: found.light.as_dict() for axis, found in self._found.items()},
+            "field_end": {axis: end.as_dict() for axis, end in self._ends.items() if end is not None},
         }
 
 
@@ -242,6 +262,7 @@ def warm_up() -> None:
             decoder.add(position, sequence.image(position).astype(decoder.camera.dtype))
         decoder.finish()
     addresses.warm_up()
+    field_end.warm_up()
     neighbours.warm_up()
     one_surface.warm_up()
     pair_noise.warm_up()

@@ -25,7 +25,7 @@ from scanner.decode.pmp_frames import AxisFrames
 from scanner.decode.pmp_join import join_maps
 from scanner.decode.pmp_light import Light, honest, judge_light, judge_ripple
 from scanner.decode.pmp_plan import plan_axis
-from scanner.decode.pmp_sample import take_sample
+from scanner.decode.pmp_sample import Sample, take_sample
 from scanner.decode.pmp_strips import decode_strips
 from scanner.decode.reasons import REASONS
 from scanner.decode.sample_kernels import MIN_PIXELS
@@ -174,6 +174,7 @@ class AxisFound:
     """(REASONS,) pixels by reason"""
     may_be_doubled: bool
     """residuals are large enough for one frame to show what another one shows; False where nobody asks"""
+    sample: Sample
 
 
 def decode_axis(
@@ -253,6 +254,7 @@ def decode_axis(
     return AxisFound(
         maps, plan.ladder, noise, found, settled, off_surface, ripple, light, random_px, counts,
         not brief and may_be_doubled(noise, sample.mean.reshape(-1), sample.modulations[finest].reshape(-1), frames),
+        sample,
     )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from scanner.decode import Decoded, Map, Reason
+from scanner.decode.field_end import keep_pull
 
 Axes = ("rows", "columns")
 
@@ -109,6 +110,9 @@ class Repetitions:
             axis: sums.mean(keep, quantised=self._quantised, unsteady=_unsteady(found[axis]))
             for axis, sums in self._sums.items()
         }
+        for axis, name in (("y", "rows"), ("x", "columns")):
+            if name in means and (end := self._first.details.get("field_end", {}).get(axis)):
+                keep_pull(*means[name], self._sums[name].count, end)
         rows, sigma_rows = means.get("rows", (None, None))
         columns, sigma_columns = means.get("columns", (None, None))
         return replace(
