@@ -245,11 +245,10 @@ def keep_pull(values: Map, sigma: Map, count: NDArray[np.uint16], told: Mapping[
 
 
 def warm_up() -> None:
-    """Compile what only a view of the field's end comes to, with sigmas and without."""
-    for size in (4, 0):
-        position, confidence, reason = np.zeros(4, np.float32), np.zeros(4, np.float32), np.zeros(4, np.uint8)
-        counts = np.zeros(len(Reason), np.int64)
-        mind_ends(position, np.zeros(size, np.float32), confidence, reason, 2, 100, lambda: None, counts)
+    """Compile what every scan comes to, and what only a view of the field's end does."""
+    position, sigma, confidence = np.zeros((3, 4), np.float32)
+    counts = np.zeros(len(Reason), np.int64)
+    mind_ends(position, sigma, confidence, np.zeros(4, np.uint8), 2, 100, lambda: None, counts)
 
 
 @lru_cache(maxsize=16)
