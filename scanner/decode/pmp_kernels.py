@@ -245,10 +245,9 @@ def _lit(
     spot: NDArray[np.float32], gains: NDArray[np.float32], min_b2: np.float32, min_sigmas2: np.float32, variance: Lanes
 ) -> Lanes:
     """Where all sets have enough modulation."""
-    sets = gains.size
-    lit = load(spot, sets * LANES) >= greatest(min_sigmas2 * gains[0] * variance, min_b2)
-    for k in range(1, sets):
-        lit = lit & (load(spot, (sets + k) * LANES) >= greatest(min_sigmas2 * gains[k] * variance, min_b2))
+    lit = _enough(spot, gains, 0, min_b2, min_sigmas2, variance)
+    for k in range(1, gains.size):
+        lit = lit & _enough(spot, gains, k, min_b2, min_sigmas2, variance)
     return lit
 
 
@@ -257,8 +256,19 @@ def _some_lit(
     spot: NDArray[np.float32], gains: NDArray[np.float32], min_b2: np.float32, min_sigmas2: np.float32, variance: Lanes
 ) -> Lanes:
     """Where any set has."""
-    sets = gains.size
-    some = load(spot, sets * LANES) >= greatest(min_sigmas2 * gains[0] * variance, min_b2)
-    for k in range(1, sets):
-        some = some | (load(spot, (sets + k) * LANES) >= greatest(min_sigmas2 * gains[k] * variance, min_b2))
+    some = _enough(spot, gains, 0, min_b2, min_sigmas2, variance)
+    for k in range(1, gains.size):
+        some = some | _enough(spot, gains, k, min_b2, min_sigmas2, variance)
     return some
+
+
+@inlined_kernel
+def _enough(
+    spot: NDArray[np.float32],
+    gains: NDArray[np.float32],
+    k: int,
+    min_b2: np.float32,
+    min_sigmas2: np.float32,
+    variance: Lanes,
+) -> Lanes:
+    return load(spot, (gains.size + k) * LANES) >= greatest(min_sigmas2 * gains[k] * variance, min_b2)
