@@ -165,18 +165,13 @@ def mind_ends(
     Returns:
         What was done; None where no coordinate is near an end.
     """
-    grid, boxes = _grid(position.size, along), np.empty((2, 4), np.int64)
-    if not _near(position, width, *grid, boxes):
+    boxes = boxes_near_ends(position, width, along)
+    if not boxes:
         return None
-    rows, step, seen = (-1, width), grid[0], heights()
+    rows, seen = (-1, width), heights()
     blurs, changed, before = [0.0, 0.0], np.zeros(2, np.int64), int(counts[Reason.VALUE])
-    for end in (0, 1):
-        top, bottom, left, right = boxes[end].tolist()
-        if bottom <= top:
-            continue
+    for end, box in boxes.items():
         blurs[end] = WIDER * blur_of(seen, position, along, end == 1)
-        top, bottom = max(top - 2 * step, 0), min(bottom + 2 * step, reason.size // width)
-        box = top, bottom, max(left - 2 * step, 0), min(right + 2 * step, width)
         _mind(
             position.reshape(rows), sigma.reshape(rows), confidence.reshape(rows), reason.reshape(rows),
             box, along, end == 1, blurs[end], pulls(), changed,
@@ -185,6 +180,23 @@ def mind_ends(
     counts[Reason.VALUE] -= left_out
     counts[Reason.BORDER] += left_out
     return FieldEnd(along, (blurs[0], blurs[1]), widened, left_out, before - left_out)
+
+
+def boxes_near_ends(position: Map, width: int, along: int) -> dict[int, tuple[int, int, int, int]]:
+    """Where coordinates are near an end: by end, 0 the first and 1 the last, (top, bottom, left, right) in pixels.
+
+    Args:
+        position: (P,) float32. width, along: see `mind_ends`.
+    """
+    grid, corners = _grid(position.size, along), np.empty((2, 4), np.int64)
+    if not _near(position, width, *grid, corners):
+        return {}
+    height, around = position.size // width, 2 * grid[0]
+    return {
+        end: (max(top - around, 0), min(bottom + around, height), max(left - around, 0), min(right + around, width))
+        for end, (top, bottom, left, right) in enumerate(corners.tolist())
+        if bottom > top
+    }
 
 
 def margin_px(along: int) -> float:

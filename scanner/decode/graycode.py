@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from scanner.decode import Coordinates, Decoded, Map, Reason
 from scanner.decode.addresses import addresses_of, maps_to_fill
+from scanner.decode.code_end import beyond_ends
 from scanner.decode.frames import FrameCheck
 from scanner.decode.graycode_bits import BOTH, INVERSE, PLAIN
 from scanner.decode.graycode_blur import blurred_bits, share_to_count, shares_decided
@@ -59,6 +60,9 @@ class GrayThresholds:
     two blurred bits"""
     min_code_probability: float = 0.999
     """probability that every bit is right that matters"""
+    least_end_share: float = 0.6
+    """of the contrast around it that a pixel has on the projected field's first or last cell: half is the end itself;
+    0: nobody asks"""
 
 
 @dataclass(frozen=True)
@@ -255,7 +259,31 @@ class GrayDecoder:
 
         counts = np.asarray(np.sum(in_strips(decode, self._pixels, self._threads), axis=0))
         shares = shares_decided(counts[REASONS:], codes.kinds.shape)
+        self._leave_ends_out(codes, counts)
         return counts[:REASONS], factor, (*warnings, *blurred_bits(pattern, shares))
+
+    def _leave_ends_out(self, codes: _Codes, counts: NDArray[np.int64]) -> None:
+        """Pixels that look beyond the field have no values."""
+        pattern, share, axes = self._pattern, self._thresholds.least_end_share, len(self._pattern.axes)
+        for index, axis in enumerate(pattern.axes if share else ()):
+            out = beyond_ends(
+                self._maps[index, : self._pixels], self._camera.width, self._sequence.projector.along(axis),
+                1 << (pattern.code_bits - pattern.bits), share, self._light_and_dark(codes, index),
+            )  # fmt: skip
+            self._maps[: 2 * axes, out], self._maps[2 * axes, out] = np.nan, 0
+            self._reason[out] = Reason.BORDER
+            counts[Reason.VALUE] -= out.size
+            counts[Reason.BORDER] += out.size
+
+    def _light_and_dark(self, codes: _Codes, index: int) -> list[tuple[NDArray[Any], NDArray[Any]]]:
+        """Frames that differ by the contrast: white and black, else an axis's two coarsest bits and their inverses, of
+        which one at most is on a border."""
+        white, black, fringes = self._sequence.white, self._sequence.black, self._sequence.fringes
+        if codes.has_levels and white is not None and black is not None:
+            return [(self._frames[white], self._frames[black])]
+        first = 2 * index * self._pattern.bits
+        pairs = range(first, first + 2 * min(self._pattern.bits, 2), 2)
+        return [(self._frames[fringes[n]], self._frames[fringes[n + 1]]) for n in pairs]
 
     def _by_axis(self) -> tuple[dict[Axis, Map], dict[Axis, Map], list[Map]]:
         """Positions and sigmas by axis; confidence, albedo and modulation."""

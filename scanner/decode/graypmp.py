@@ -164,7 +164,9 @@ class GrayPmpDecoder:
         # Cells beyond one fringe name two, between which the phase does not choose.
         of_fringe = self._sequence.projector.along(self._pattern.axes[0]) / self._pattern.pmp.frequencies[0]
         together = max(round(of_fringe / self._pattern.cell_px) - 1, 1)
-        thresholds = GrayThresholds(max_open_cells=min(together, GrayThresholds.max_open_cells))
+        # What is left out at the field's end, the fringes say.
+        open_cells = min(together, GrayThresholds.max_open_cells)
+        thresholds = GrayThresholds(max_open_cells=open_cells, least_end_share=0)
         decoder = GrayDecoder(part, self._camera, thresholds, self._threads)
         for position, frame in frames.items():
             decoder.keep(position, frame)

@@ -8,6 +8,7 @@ from scipy.special import ndtr
 
 from scanner.decode import Reason, decoder_for
 from scanner.decode.field_end import REACH, WIDER, FieldEnd, Heights, blur_of, mind_ends, pulls
+from scanner.decode.graycode import GrayDecoder, GrayThresholds
 from scanner.decode.pmp import PmpDecoder
 from scanner.decode.reasons import REASONS
 from scanner.decode.repeated import Repetitions
@@ -77,6 +78,39 @@ def test_near_the_end_errors_are_within_sigmas_and_beyond_it_nothing_is_said(pat
     assert told["blur_px"] == pytest.approx([WIDER * blur_px] * 2, rel=0.12, abs=0.6)
     assert told["left_out"] > 0
     assert told["widened"] > 0
+
+
+@pytest.mark.parametrize(
+    ("pattern", "blur_px", "levels"),
+    [
+        (GrayPattern(("x",), 9, 9), 0.7, True),
+        (GrayPattern(("x",), 7, 9), 2.0, False),
+        (GrayPattern(("y",), 7, 9, inverse=False), 4.0, True),
+        (GrayPattern(("y",), 8, 9, code="binary"), 2.0, False),
+    ],
+)
+def test_a_code_says_nothing_beyond_the_end(pattern, blur_px, levels):
+    (axis,) = pattern.axes
+    sequence = (
+        PatternSequence.bracketed(PROJECTOR[axis], pattern) if levels else PatternSequence(PROJECTOR[axis], pattern)
+    )
+    camera, truth, frames = take(sequence, blur_px, axis=axis)
+    every = GrayDecoder(sequence, camera, GrayThresholds(least_end_share=0))
+    whole, brief = GrayDecoder(sequence, camera), GrayDecoder(sequence, camera)
+    for position, frame in enumerate(frames):
+        for decoder in (every, whole, brief):
+            decoder.keep(position, frame)
+    every, whole, brief = every.finish(), whole.finish(), brief.coordinates()
+    (values, sigma), before = found_of(whole, axis), found_of(every, axis)[0]
+    inside = np.minimum(truth + 0.5, ALONG - 0.5 - truth) / blur_px
+    assert np.isfinite(before)[(inside > -1) & (inside < 0)].mean() > 0.5
+    assert np.isfinite(values)[inside < 0].mean() < 0.01
+    np.testing.assert_array_equal(values[inside > 0.6], before[inside > 0.6])
+    assert (np.isnan(values) == np.isnan(sigma)).all()
+    assert (np.isfinite(values) == (whole.reason == Reason.VALUE)).all()
+    assert whole.details["counts"]["border"] == np.count_nonzero(whole.reason == Reason.BORDER)
+    np.testing.assert_array_equal(brief.columns if axis == "x" else brief.rows, values)
+    np.testing.assert_array_equal(brief.confidence, whole.confidence)
 
 
 def test_coordinates_alone_end_where_those_with_sigmas_do():
