@@ -5,7 +5,7 @@
 For one thread and for as many as there are: ms to decode frames that are all at hand, to all maps (`finish`) and to
 coordinates and confidence alone (`coordinates`); ms a frame and after the last one where they come one by one, and how
 much that is beyond a pass over frames at hand; reading all frames once, and writing two float32 maps besides; a decode
-with OpenCV and NumPy; and `fringes` (PyPI, mode "fast"), if it is installed. Frames rotate over several stacks, so that
+with OpenCV and NumPy; and `fringes` (PyPI, mode "fast"), or with --gray OpenCV's GrayCodePattern, if installed. Frames rotate over several stacks, so that
 none is still in a cache from the run before. Medians and (least) times; ratios are medians of ratios of what ran one
 after the other, and (those of the least times): a busy machine moves medians of what takes long, and of two threads
 more than of one. A decoder and its maps are made before its time runs, as in a scan.
@@ -60,7 +60,9 @@ def main():
     print(f"{len(sequence)} frames {width} x {height}, {camera.dtype}; ms, median (least)")
     for threads in sorted({1, threads_to_use()}):
         measure(kind, sequence, camera, stacks, chosen.runs, threads)
-    if not chosen.gray:
+    if chosen.gray:
+        measure_peer(stacks[0])
+    else:
         measure_others(sequence, camera, stacks, chosen.runs)
 
 
@@ -167,6 +169,20 @@ def time_of(decode, frames):
     begin = time.perf_counter()
     decode(frames)
     return time.perf_counter() - begin
+
+
+def measure_peer(frames):
+    """Print what OpenCV's GrayCodePattern needs, if opencv-contrib is there: its decode is for two cameras at once."""
+    if not hasattr(cv2, "structured_light"):
+        print("opencv-contrib is not installed: no comparison with its GrayCodePattern")
+        return
+    columns, rows = (2 * int(np.ceil(np.log2(size))) for size in (PROJECTOR.width, PROJECTOR.height))
+    images = [*frames[:columns], *frames[-rows:]]
+    peer = cv2.structured_light.GrayCodePattern.create(PROJECTOR.width, PROJECTOR.height)
+    black, white = np.zeros_like(images[0]), np.full_like(images[0], 255)
+    begin = time.perf_counter()
+    peer.decode([images, images], None, [black, black], [white, white])
+    print(f"{'OpenCV, half of two cameras':30s}{500 * (time.perf_counter() - begin):8.1f}")
 
 
 def coordinates_of(sequence, camera, frames):
