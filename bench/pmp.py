@@ -5,10 +5,11 @@
 For one thread and for as many as there are: ms to decode frames that are all at hand, to all maps (`finish`) and to
 coordinates and confidence alone (`coordinates`); ms a frame and after the last one where they come one by one, and how
 much that is beyond a pass over frames at hand; reading all frames once, and writing two float32 maps besides; a decode
-with OpenCV and NumPy; and `fringes` (PyPI, mode "fast"), or with --gray OpenCV's GrayCodePattern, if installed. Frames rotate over several stacks, so that
-none is still in a cache from the run before. Medians and (least) times; ratios are medians of ratios of what ran one
-after the other, and (those of the least times): a busy machine moves medians of what takes long, and of two threads
-more than of one. A decoder and its maps are made before its time runs, as in a scan.
+with OpenCV and NumPy; and `fringes` (PyPI, mode "fast"), or with --gray OpenCV's GrayCodePattern, if installed.
+Frames rotate over several stacks, so that none is still in a cache from the run before. Medians and (least) times;
+ratios are medians of ratios of what ran one after the other, and (those of the least times): a busy machine moves
+medians of what takes long, and of two threads more than of one. A decoder and its maps are made before its time runs,
+as in a scan.
 """
 
 from __future__ import annotations
