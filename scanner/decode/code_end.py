@@ -8,14 +8,15 @@ Texture that is darker by as much is left out with them, there and nowhere else.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Map
+from scanner.decode.addresses import pixels_at
 from scanner.decode.field_end import boxes_near_ends
+from scanner.kernel import kernel
 
 ALSO_NEAR_PX = 4.0
 """Beyond the end's cell, projector px: a blur of 4 px draws inward by no more what lies beyond the end"""
@@ -31,7 +32,8 @@ def beyond_ends(
     along: int,
     cell_px: int,
     least_share: float,
-    light_and_dark: Sequence[tuple[NDArray[Any], NDArray[Any]]],
+    pairs: NDArray[np.intp],
+    like: NDArray[Any],
 ) -> NDArray[np.intp]:
     """Pixels that look beyond an end of the field, by their contrast.
 
@@ -39,25 +41,51 @@ def beyond_ends(
         position: (P,) float32 projector px, NaN where undecided. width: pixels a row.
         along: projector px of the field. cell_px: of a cell of the code.
         least_share: of the contrast around that a pixel inside has.
-        light_and_dark: frames that differ by the contrast, of any shape; the pair counts that differs most.
+        pairs: (N, 2) addresses of frames that differ by the contrast, which is that of the pair that differs most.
+        like: (0,) of the frames' dtype.
     """
-    found = [np.empty(0, np.intp)]
-    for end, (top, bottom, left, right) in boxes_near_ends(position, width, along).items():
-        inside = position.reshape(-1, width)[top:bottom, left:right] + np.float32(0.5)
-        y, x = np.nonzero((along - inside if end else inside) < cell_px + ALSO_NEAR_PX)
-        found.append((y + top) * width + x + left)
-    near = np.unique(np.concatenate(found))
-    if not near.size:
-        return near
-    y, x = np.divmod(near, width)
-    best = np.zeros(near.size, np.float32)
-    for far in AROUND:
-        for down, across in ((far, 0), (-far, 0), (0, far), (0, -far)):
-            there = np.clip(y + down, 0, position.size // width - 1) * width + np.clip(x + across, 0, width - 1)
-            best = np.maximum(best, _contrast(light_and_dark, there))
-    return near[_contrast(light_and_dark, near) < least_share * best]
+    found = [
+        _beyond(position, width, box, along, end == 1, cell_px + ALSO_NEAR_PX, least_share, pairs, like)
+        for end, box in boxes_near_ends(position, width, along).items()
+    ]
+    return np.unique(np.concatenate(found)) if found else np.empty(0, np.intp)
 
 
-def _contrast(pairs: Sequence[tuple[NDArray[Any], NDArray[Any]]], pixels: NDArray[np.intp]) -> NDArray[np.float32]:
-    levels = ((light.reshape(-1)[pixels], dark.reshape(-1)[pixels].astype(np.float32)) for light, dark in pairs)
-    return np.asarray(np.max([np.abs(light - dark) for light, dark in levels], axis=0), np.float32)
+@kernel
+def _beyond(
+    position: Map,
+    width: int,
+    box: tuple[int, int, int, int],
+    along: int,
+    last: bool,
+    near: float,
+    least_share: float,
+    pairs: NDArray[np.intp],
+    like: NDArray[Any],
+) -> NDArray[np.intp]:
+    """One end's, within its box: top, bottom, left, right."""
+    top, bottom, left, right = box
+    height, found = position.size // width, 0
+    out = np.empty(max((bottom - top) * (right - left), 0), np.intp)
+    for y in range(top, bottom):
+        for x in range(left, right):
+            inside = position[y * width + x] + np.float32(0.5)
+            if (along - inside if last else inside) < near:
+                best = np.float32(0)
+                for far in AROUND:
+                    for down, across in ((far, 0), (-far, 0), (0, far), (0, -far)):
+                        row, column = min(max(y + down, 0), height - 1), min(max(x + across, 0), width - 1)
+                        best = max(best, _contrast(row * width + column, pairs, like))
+                if _contrast(y * width + x, pairs, like) < np.float32(least_share) * best:
+                    out[found] = y * width + x
+                    found += 1
+    return out[:found]
+
+
+@kernel
+def _contrast(pixel: int, pairs: NDArray[np.intp], like: NDArray[Any]) -> np.float32:
+    most = np.float32(0)
+    for n in range(len(pairs)):
+        light, dark = pixels_at(pairs[n, 0], pixel, 1, like)[0], pixels_at(pairs[n, 1], pixel, 1, like)[0]
+        most = max(most, abs(np.float32(light) - np.float32(dark)))
+    return most

@@ -265,25 +265,17 @@ class GrayDecoder:
     def _leave_ends_out(self, codes: _Codes, counts: NDArray[np.int64]) -> None:
         """Pixels that look beyond the field have no values."""
         pattern, share, axes = self._pattern, self._thresholds.least_end_share, len(self._pattern.axes)
+        # Without white and black an axis's two coarsest bits and their inverses: one at most is on a border.
+        pairs = codes.levels[None] if codes.has_levels else codes.addresses[:, :2]
         for index, axis in enumerate(pattern.axes if share else ()):
             out = beyond_ends(
                 self._maps[index, : self._pixels], self._camera.width, self._sequence.projector.along(axis),
-                1 << (pattern.code_bits - pattern.bits), share, self._light_and_dark(codes, index),
+                1 << (pattern.code_bits - pattern.bits), share, pairs if codes.has_levels else pairs[index], codes.like,
             )  # fmt: skip
             self._maps[: 2 * axes, out], self._maps[2 * axes, out] = np.nan, 0
             self._reason[out] = Reason.BORDER
             counts[Reason.VALUE] -= out.size
             counts[Reason.BORDER] += out.size
-
-    def _light_and_dark(self, codes: _Codes, index: int) -> list[tuple[NDArray[Any], NDArray[Any]]]:
-        """Frames that differ by the contrast: white and black, else an axis's two coarsest bits and their inverses, of
-        which one at most is on a border."""
-        white, black, fringes = self._sequence.white, self._sequence.black, self._sequence.fringes
-        if codes.has_levels and white is not None and black is not None:
-            return [(self._frames[white], self._frames[black])]
-        first = 2 * index * self._pattern.bits
-        pairs = range(first, first + 2 * min(self._pattern.bits, 2), 2)
-        return [(self._frames[fringes[n]], self._frames[fringes[n + 1]]) for n in pairs]
 
     def _by_axis(self) -> tuple[dict[Axis, Map], dict[Axis, Map], list[Map]]:
         """Positions and sigmas by axis; confidence, albedo and modulation."""

@@ -81,20 +81,20 @@ def test_near_the_end_errors_are_within_sigmas_and_beyond_it_nothing_is_said(pat
 
 
 @pytest.mark.parametrize(
-    ("pattern", "blur_px", "levels"),
+    ("pattern", "blur_px", "levels", "bits"),
     [
-        (GrayPattern(("x",), 9, 9), 0.7, True),
-        (GrayPattern(("x",), 7, 9), 2.0, False),
-        (GrayPattern(("y",), 7, 9, inverse=False), 4.0, True),
-        (GrayPattern(("y",), 8, 9, code="binary"), 2.0, False),
+        (GrayPattern(("x",), 9, 9), 0.7, True, 8),
+        (GrayPattern(("x",), 7, 9), 2.0, False, 10),
+        (GrayPattern(("y",), 7, 9, inverse=False), 4.0, True, 10),
+        (GrayPattern(("y",), 8, 9, code="binary"), 2.0, False, 8),
     ],
 )
-def test_a_code_says_nothing_beyond_the_end(pattern, blur_px, levels):
+def test_a_code_says_nothing_beyond_the_end(pattern, blur_px, levels, bits):
     (axis,) = pattern.axes
     sequence = (
         PatternSequence.bracketed(PROJECTOR[axis], pattern) if levels else PatternSequence(PROJECTOR[axis], pattern)
     )
-    camera, truth, frames = take(sequence, blur_px, axis=axis)
+    camera, truth, frames = take(sequence, blur_px, bits, axis)
     every = GrayDecoder(sequence, camera, GrayThresholds(least_end_share=0))
     whole, brief = GrayDecoder(sequence, camera), GrayDecoder(sequence, camera)
     for position, frame in enumerate(frames):
