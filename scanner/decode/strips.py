@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, lru_cache
-from threading import Event
 from typing import TypeVar
 
 import numba
@@ -63,38 +62,44 @@ def begins_of(pixels: int, threads: int) -> NDArray[np.intp]:
 class Shared:
     """Strips that threads take by turns inside a kernel, which all but one enter before it is known what to do.
 
-    A context: it is left when no other thread is at work any more, and if it is left before `open`, none has been.
+    Nobody sleeps for it: who finds the gate shut for too long leaves, and is called once more when it opens. So an
+    interrupt, wherever it comes, leaves nobody behind. A context: it is left when no other thread is at work any more,
+    and if it is left before `open`, none has been.
     """
 
     def __init__(self, work: Callable[[NDArray[np.int64], NDArray[np.int64]], bool], threads: int, counts: int) -> None:
         """work(gate, counts): waits at the gate and takes strips; False if the gate stayed shut too long (see
         `pmp_strips.decode_strips`). counts: how many numbers it adds to."""
-        self._work, self._gate, self._decided = work, new_gate(), Event()
+        self._work, self._gate, self._opened = work, new_gate(), False
         self._counts = np.zeros((threads, counts), np.int64)
-        self._others = [_crew().submit(self._share, n) for n in range(1, threads)]
+        self._others: dict[int, Future[bool]] = {}
+        self._call(range(1, threads))
 
-    def _share(self, n: int) -> None:
-        if not self._work(self._gate, self._counts[n]):
-            self._decided.wait()
-            self._work(self._gate, self._counts[n])
+    def _call(self, numbers: Iterable[int]) -> None:
+        """Have others wait at the gate, which is shut; where no thread can be had, this one does all by itself."""
+        try:
+            for n in numbers:
+                self._others[n] = _crew().submit(self._work, self._gate, self._counts[n])
+        except RuntimeError:
+            # One that nobody knows of may have been handed over all the same: what it finds is a gate of its own.
+            set_gate(self._gate, ABANDONED)
+            self._gate, self._others = new_gate(), {}
 
     def open(self) -> None:
         """What the work needs is there: others begin."""
-        self._decide(OPEN)
+        self._call([n for n, other in self._others.items() if other.done()])
+        self._opened = True
+        set_gate(self._gate, OPEN)
 
     def finish(self) -> NDArray[np.int64]:
         """Take strips as well, until all is done; sums of counts."""
-        self._share(0)
+        self._work(self._gate, self._counts[0])
         self._join()
         return np.asarray(self._counts.sum(axis=0))
 
-    def _decide(self, state: int) -> None:
-        set_gate(self._gate, state)
-        self._decided.set()
-
     def _join(self) -> None:
         # One that has not begun is not waited for: its strips are done, and those before it may wait for this one.
-        for other in self._others:
+        for other in self._others.values():
             if not other.cancel():
                 other.result()
 
@@ -102,10 +107,9 @@ class Shared:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if not self._decided.is_set():
-            self._decide(ABANDONED)
-            self._join()
-        elif not all(other.done() for other in self._others):
+        if not self._opened:
+            set_gate(self._gate, ABANDONED)
+        if not all(other.done() for other in self._others.values()):
             self._join()
 
 

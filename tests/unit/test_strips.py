@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from threading import current_thread, main_thread
 
 import numpy as np
 import pytest
 
+from scanner.decode import strips
 from scanner.decode.gate import ABANDONED, OPEN, SHUT, new_gate, next_turn, set_gate, wait_for
 from scanner.decode.strips import MIN_STRIP, Shared, begins_of
 
@@ -38,12 +40,13 @@ def test_each_turn_is_taken_once():
 
 
 def work_of(strips, taken, patience=True):
-    """As `decode_strips`; without patience a shut gate is left at once."""
+    """As `decode_strips`; without patience the first other thread leaves a shut gate at once."""
 
     def work(gate, counts):
-        state = wait_for(gate) if patience or taken else SHUT
-        if not patience and not taken:
+        if not patience and not taken and current_thread() is not main_thread():
             taken.append(-1)
+            return False
+        state = wait_for(gate)
         if state != OPEN:
             return state != SHUT
         while (strip := next_turn(gate)) < strips:
@@ -56,7 +59,7 @@ def work_of(strips, taken, patience=True):
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
 @pytest.mark.parametrize("patience", [True, False])
-def test_every_strip_is_done_once_by_threads_that_waited_or_slept(threads, patience):
+def test_every_strip_is_done_once_by_threads_that_waited_or_left(threads, patience):
     taken = []
     with Shared(work_of(40, taken, patience), threads, 2) as shared:
         shared.open()
@@ -78,3 +81,29 @@ def test_what_fails_is_told_when_the_others_are_done_or_sent_away(opened):
     with pytest.raises(ZeroDivisionError):
         failing()
     assert len(taken) in ((0, 40) if opened else (0,))
+
+
+def test_an_interrupt_before_the_context_leaves_no_thread_waiting():
+    Shared(work_of(40, []), 4, 2)  # as if a signal came between the call and the `with`
+    assert [future.result(timeout=30) for future in (strips._crew().submit(int) for _ in range(3))] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("refused", [0, 1])
+def test_without_more_threads_one_does_it_all(refused, monkeypatch):
+    crew, submitted = strips._crew(), []
+
+    class Short:
+        def submit(self, *call):
+            submitted.append(crew.submit(*call))  # handed over, and nobody is told
+            if len(submitted) > refused:
+                raise RuntimeError("can't start new thread")
+            return submitted[-1]
+
+    taken = []
+    monkeypatch.setattr(strips, "_crew", Short)
+    with Shared(work_of(40, taken), 3, 2) as shared:
+        shared.open()
+        counts = shared.finish()
+    assert taken == list(range(40))
+    assert counts.tolist() == [40, sum(range(40))]
+    assert all(future.result(timeout=30) for future in submitted)
