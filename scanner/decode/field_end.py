@@ -49,6 +49,9 @@ all of them lies near an end, and nothing around them does."""
 LEAST_BLUR_PX = 1 / math.sqrt(12)
 """A projector pixel's own width"""
 
+LEAST_LOST = 0.01
+"""Of the height of fine fringes, that tells of a blur: a response and rounding change heights by as much"""
+
 SHARP_PX = 1.0
 """Where nothing tells the blur: that of projector and camera in focus (.7 px each)"""
 
@@ -171,10 +174,11 @@ def mind_ends(
     rows, seen = (-1, width), heights()
     blurs, changed, before = [0.0, 0.0], np.zeros(2, np.int64), int(counts[Reason.VALUE])
     for end, box in boxes.items():
-        blurs[end] = WIDER * blur_of(seen, position, along, end == 1)
+        known, widest = blur_of(seen, position, along, end == 1)
+        blurs[end] = WIDER * widest
         _mind(
             position.reshape(rows), sigma.reshape(rows), confidence.reshape(rows), reason.reshape(rows),
-            box, along, end == 1, blurs[end], pulls(), changed,
+            box, along, end == 1, blurs[end] if known else LEAST_BLUR_PX, blurs[end], pulls(), changed,
         )  # fmt: skip
     left_out, widened = changed.tolist()
     counts[Reason.VALUE] -= left_out
@@ -204,14 +208,15 @@ def margin_px(along: int) -> float:
     return min(max(MARGIN_SHARE * along, MARGIN_PX), along / 2)
 
 
-def blur_of(heights: Heights | None, position: Map, along: int, last: bool) -> float:
-    """1-sigma of the blur at an end, projector px, on the safe side of what it is known by.
+def blur_of(heights: Heights | None, position: Map, along: int, last: bool) -> tuple[bool, float]:
+    """1-sigma of the blur at an end, projector px, on the safe side of what it is known by; and whether it is known to
+    be more than a pixel's own width: where it is not, sigmas are widened, but nothing is left out for it.
 
     Args:
         position: (P,) float32, NaN where undecided. along: see `mind_ends`. last: the end of the highest coordinates.
     """
     if heights is None:
-        return SHARP_PX
+        return False, SHARP_PX
     room = position[heights.pixels] + np.float32(0.5)
     room = along - room if last else room
     # What the end itself has cut off keeps its fine fringes longer.
@@ -220,12 +225,15 @@ def blur_of(heights: Heights | None, position: Map, along: int, last: bool) -> f
     near = inside[room[inside] < NEAR_SHARE * along]
     ratios = heights.ratios[near if near.size >= NEAR_PIXELS else inside]
     if ratios.size < FEWEST:
-        return SHARP_PX
+        return False, SHARP_PX
     middle = float(np.median(ratios))
     # A median's own error: 1.25 times a mean's, by the spread that the ratios' middle half has.
     error = 1.2533 * 1.4826 * float(np.median(np.abs(ratios - middle))) / math.sqrt(ratios.size)
-    variance = -math.log(min(max(middle - 2 * error, 1e-6), 1.0)) * heights.per_log_px2
-    return min(max(math.sqrt(variance), LEAST_BLUR_PX), margin / (REACH * WIDER))
+    blurs = (
+        math.sqrt(-math.log(min(max(ratio, 1e-6), 1.0)) * heights.per_log_px2) for ratio in (middle, middle - 2 * error)
+    )
+    likely, widest = (min(max(blur, LEAST_BLUR_PX), margin / (REACH * WIDER)) for blur in blurs)
+    return likely > 2 * LEAST_BLUR_PX and middle < 1 - LEAST_LOST, widest
 
 
 @cache
@@ -300,13 +308,17 @@ def _mind(
     box: tuple[int, int, int, int],
     along: int,
     last: bool,
+    leaving: float,
     blur: float,
     pulls: NDArray[np.float32],
     changed: NDArray[np.int64],
 ) -> None:
-    """One end's part of `mind_ends` within a box: top, bottom, left, right. changed: left out, widened, is added to."""
+    """One end's part of `mind_ends` within a box: top, bottom, left, right.
+
+    leaving, blur: by which pixels are left out, and sigmas widened. changed: left out, widened, is added to.
+    """
     top, bottom, left, right = box
-    unit, most, least = np.float32(1 / blur), np.float32(REACH * blur), np.float32(_HALF_NORMAL_MEAN * blur)
+    unit, most, least = np.float32(1 / blur), np.float32(REACH * blur), np.float32(_HALF_NORMAL_MEAN * leaving)
     for y in range(top, bottom):
         for begin in range(left, right, _TOGETHER):
             stretch = slice(begin, min(begin + _TOGETHER, right))

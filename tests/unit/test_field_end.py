@@ -178,9 +178,9 @@ def test_its_kernels_do_what_plain_numpy_does():
 
 
 def test_a_blur_that_nothing_tells_is_that_of_lenses_in_focus():
-    assert blur_of(None, np.zeros(4, np.float32), 100, last=False) == 1
+    assert blur_of(None, np.zeros(4, np.float32), 100, last=False) == (False, 1)
     few = Heights(np.arange(4), np.ones(4, np.float32), 50.0)
-    assert blur_of(few, np.full(4, 50, np.float32), 100, last=False) == 1
+    assert blur_of(few, np.full(4, 50, np.float32), 100, last=False) == (False, 1)
 
 
 def test_repetitions_take_noise_away_and_leave_the_pull():
@@ -204,3 +204,14 @@ def test_a_code_with_fewer_words_than_columns_is_refused():
     short = default_gray_pmp(("x",), ProjectorSize(1024, 16))
     with pytest.raises(DecodeError, match="name 1024 positions"):
         decoder_for(PatternSequence(size, short), CameraFormat(8, 8))
+
+
+@pytest.mark.parametrize("frequencies", [(1.0, 8.0), (1.0, 8.0, 64.0)])
+def test_frames_without_any_blur_are_decoded_to_the_last_pixel(frequencies):
+    size = ProjectorSize(640, 480)
+    sequence = PatternSequence(size, PmpPattern(("y",), frequencies, (4,) * len(frequencies)))
+    decoder = PmpDecoder(sequence, CameraFormat(640, 480, 8))
+    for position in range(len(sequence)):
+        decoder.add(position, sequence.image(position))
+    rows = decoder.finish().rows
+    assert np.abs(rows - np.arange(480)[:, None]).max() < 0.1
