@@ -90,6 +90,8 @@ def run(words: list[str], *, debug: bool, as_json: bool) -> int:
             _leave_output()
             print_error(str(fault), fault.hint)
             return FAILED
+        if isinstance(error, SystemError) and isinstance(error.__cause__, KeyboardInterrupt):
+            return _interrupted(as_json)  # Ctrl-C inside a compiled kernel comes out so
         _report_bug(error, debug=debug, as_json=as_json)
         return FAILED
 

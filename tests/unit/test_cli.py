@@ -126,7 +126,13 @@ def test_a_bug_shows_one_line_and_where_the_rest_is(
     assert [("Traceback" in log.read_text()) for log in logs] == ([] if debug else [True])
 
 
-@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), 130), (typer.Abort(), 130)])
+IN_A_KERNEL = SystemError("CPUDispatcher(judge) returned a result with an exception set")
+IN_A_KERNEL.__cause__ = KeyboardInterrupt()
+
+
+@pytest.mark.parametrize(
+    ("error", "status"), [(KeyboardInterrupt(), 130), (typer.Abort(), 130), (IN_A_KERNEL, 130)], ids=repr
+)
 def test_an_interrupted_command_is_130(
     error: BaseException, status: int, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
