@@ -7,7 +7,7 @@ poses of which some are unusable still calibrates, and says which were left out 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.calibration.copies import again, capture_key
 from scanner.calibration.detection import FEWEST_POINTS, NotFound, detect
 from scanner.calibration.problem import View
 from scanner.calibration.projector_points import projector_points
 from scanner.calibration.targets import Target
 from scanner.capture import Capture
-from scanner.decode import Decoded, decoder_for
-from scanner.errors import ConfigError, ScannerError, SyncError
+from scanner.decode import Decoded, Decoder, decoder_for
+from scanner.errors import ConfigError, DecodeError, ScannerError, SyncError
 from scanner.sequencer import check_capture
 
 HEADER_FILE = "capture.json"
@@ -35,7 +36,7 @@ FLATTEST = 0.02
 @dataclass(frozen=True, eq=False)
 class Observation:
     """One usable capture. response: what its patterns were corrected for; created: when it was taken; warm_up: how warm
-    the rig was, as capture.json has it."""
+    the rig was, as capture.json has it; key: what its copies have too."""
 
     view: View
     camera_size: tuple[int, int]
@@ -43,6 +44,7 @@ class Observation:
     response: dict[str, Any] | None = None
     created: str = ""
     warm_up: Mapping[str, Any] = field(default_factory=dict)
+    key: Hashable = None
 
 
 @dataclass(frozen=True)
@@ -81,13 +83,17 @@ def natural(path: Path) -> list[str | int]:
 def observe(
     paths: Sequence[Path], target: Target, progress: Callable[[int, int], None] | None = None
 ) -> tuple[list[Observation], list[LeftOut]]:
-    """Look at every capture; see `observe_capture`. progress is told (done, total)."""
+    """Look at every capture; see `observe_capture`. Copies of one that serves are left out. progress: (done, total)."""
     observations, left_out = [], []
     names = _names(paths)
+    seen: dict[Hashable, tuple[Path, str]] = {}
     for done, (path, name) in enumerate(zip(paths, names, strict=True)):
         outcome = observe_capture(path, name, target)
+        if isinstance(outcome, Observation) and (how := again(path, (outcome.key,), seen)) is not None:
+            outcome = LeftOut(name, f"it {how}, and tells nothing new")
         if isinstance(outcome, Observation):
             observations.append(outcome)
+            seen[outcome.key] = path, name
         else:
             left_out.append(outcome)
         if progress is not None:
@@ -113,18 +119,22 @@ def observe_capture(path: Path, name: str, target: Target) -> Observation | Left
         axes = set(getattr(sequence.pattern, "axes", ()))
         if axes != {"x", "y"}:
             return LeftOut(name, "its patterns run along one axis only: capture with --axis xy")
+        if capture.header.state == "failed":
+            return LeftOut(name, f"its capture failed ({capture.header.reason or 'no reason told'}): capture it again")
+        capture.require_any()
         check_capture(capture).raise_if_out_of_step()
         decoder = decoder_for(sequence, capture.header.camera)
         for pattern in capture.records:
             if pattern < len(sequence):
                 decoder.add(pattern, capture.frame(pattern))
-        decoded = decoder.finish()
+        decoded = _finished(decoder, capture)
         at = sequence.white
         white = None if at is None or at not in capture.records else capture.frame(at)
+        key = capture_key(capture)
     except SyncError as error:
         return LeftOut(name, f"frames out of step: {error}", out_of_step=True)
     except ScannerError as error:
-        return LeftOut(name, str(error))
+        return LeftOut(name, str(error) if error.hint is None else f"{error}; {error.hint}")
     view = observe_decoded(name, decoded, target, white=white, mosaic=capture.header.camera.mosaic is not None)
     if isinstance(view, LeftOut):
         return view
@@ -137,6 +147,7 @@ def observe_capture(path: Path, name: str, target: Target) -> Observation | Left
         None if correction is None else correction.describe(),
         capture.header.created,
         capture.header.extra.get("warm_up") or {},
+        key,
     )
 
 
@@ -170,6 +181,16 @@ def observe_decoded(
     if extents[1] < FLATTEST * extents[0]:
         return LeftOut(name, "the points that are seen lie on a line")
     return View(name, found.ids[kept], found.points[kept], seen.points[kept], seen.sigma[kept], seen.slope[kept])
+
+
+def _finished(decoder: Decoder, capture: Capture) -> Decoded:
+    """What is decoded; an error names what is to blame for the first of the frames that are not there."""
+    try:
+        return decoder.finish()
+    except DecodeError as error:
+        if not capture.missing:
+            raise
+        raise DecodeError(f"{error}; {capture.fault(capture.missing[0])}", hint=error.hint) from error
 
 
 def _below(folder: Path, depth: int) -> Iterator[Path]:

@@ -85,16 +85,19 @@ class Capture:
             DecodeError: there are none; which file is to blame, and why.
         """
         if not self._records:
-            raise DecodeError(f"no frame can be taken: {self._fault()}", hint=_NO_FRAME)
+            raise DecodeError(f"no frame can be taken: {self.fault()}", hint=_NO_FRAME)
         return self._records
 
-    def _fault(self) -> str:
+    def fault(self, pattern: int | None = None) -> str:
+        """Why the frame of a pattern that is `missing` is not here: which file is to blame. None: of the last line."""
         lines, frames = self.path / RECORDS_FILE, self.path / FRAMES_FILE
         if self._slots is None:
             return f"{frames} holds none"
-        if not self.all_records:
-            return f"{lines} holds no whole line that is a frame's record"
-        last = self.all_records[-1]
+        told = [record for record in self.all_records if pattern in (None, record.pattern)]
+        if not told:
+            of = "a frame's record" if pattern is None else f"the record of pattern {pattern}"
+            return f"{lines} holds no whole line that is {of}"
+        last = told[-1]
         if last.pattern >= self.header.frame_count:
             return f"{lines} tells of pattern {last.pattern}, and the capture has {self.header.frame_count} from 0"
         if last.status != "ok" or last.slot is None:

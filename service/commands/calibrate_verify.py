@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
+from collections.abc import Hashable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -190,18 +190,15 @@ def mcp(
 
 def _refuse_twice(scans: list[Path]) -> None:
     """A scan that is compared with itself repeats perfectly, and so does a copy of it."""
-    seen: dict[object, Path] = {}
+    from scanner.calibration.copies import again, file_key  # noqa: PLC0415
+
+    seen: dict[Hashable, tuple[Path, str]] = {}
     for folder in scans:
         file = folder / "scan.npz"
-        keys: list[object] = [folder.resolve()]
-        if file.is_file():
-            with file.open("rb") as content:
-                keys.append(hashlib.file_digest(content, "sha256").digest())
-        for key in keys:
-            if key in seen:
-                how = "is given twice" if folder.resolve() == seen[key].resolve() else f"is a copy of {seen[key]}"
-                raise typer.BadParameter(f"--repeat: {folder} {how}; it takes scans of their own, one after the other")
-            seen[key] = folder
+        keys: list[Hashable] = [folder.resolve(), *([file_key(file)] if file.is_file() else [])]
+        if (how := again(folder, keys, seen)) is not None:
+            raise typer.BadParameter(f"--repeat: {folder} {how}; it takes scans of their own, one after the other")
+        seen.update((key, (folder, str(folder))) for key in keys)
 
 
 def _errors(document: dict[str, Any]) -> list[tuple[float, float | None]]:

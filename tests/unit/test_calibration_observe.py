@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from scanner.calibration.observe import (
 )
 from scanner.calibration.targets import parse_target
 from scanner.capture import Capture, CaptureHeader
+from scanner.capture.header import FrameRecord, digest
 from scanner.decode import decoder_for
 from scanner.errors import ConfigError
 from scanner.geometry import load_calibration
@@ -161,6 +163,48 @@ def test_damaged_captures_are_left_out(poses: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="holds no capture"):
         find_captures([tmp_path / "empty"])
     assert find_captures([poses / "p00", poses / "p00" / "capture"]) == [poses / "p00" / "capture"]
+
+
+def test_frames_that_do_not_match_their_digests_are_named(poses: Path, tmp_path: Path) -> None:
+    """All of them, or so many that no fringe set is left: the pixels are to blame, and the file is named."""
+    good = poses / "p04" / "capture"
+    frames = np.load(good / "frames.npy")
+    for name, damaged in (("whole", len(frames)), ("part", 6)):
+        folder = tmp_path / name
+        shutil.copytree(good, folder)
+        digests = [digest(frame) if k >= damaged else "0" * 16 for k, frame in enumerate(frames)]
+        lines = [json.dumps(FrameRecord(k, k, xxh3=told).as_dict()) + "\n" for k, told in enumerate(digests)]
+        (folder / "frames.jsonl").write_text("".join(lines))
+        found = observe_capture(folder, name, TARGET)
+        assert isinstance(found, LeftOut)
+        slot = 0 if name == "part" else len(frames) - 1
+        assert f"frames.npy, slot {slot}, are not those that the digest in frames.jsonl was made of" in found.reason
+
+
+def test_copies_and_failed_captures_are_no_poses(poses: Path, tmp_path: Path) -> None:
+    """A copy is known by its id and time, of a capture without them by its pixels; one id for all is no copy."""
+    identities = {
+        "a1": ("one", "today"),
+        "a2": ("one", "today"),
+        "b1": ("", ""),
+        "b2": ("", ""),
+        "c1": ("same", ""),
+        "d1": ("f", "today"),
+    }
+    for name, (identity, created) in identities.items():
+        shutil.copytree(poses / ("p04" if name != "c1" else "p06") / "capture", tmp_path / name)
+        file = tmp_path / name / "capture.json"
+        told = {"id": identity, "created": created, "state": "failed" if name == "d1" else "complete"}
+        file.write_text(json.dumps({**json.loads(file.read_text()), **told, "reason": "camera lost"}))
+    (tmp_path / "a3").symlink_to(tmp_path / "a1")
+    observations, left_out = observe(find_captures([tmp_path]), TARGET)
+    assert [one.view.name for one in observations] == ["a1", "b1", "c1"]
+    reasons = {one.name: one.reason for one in left_out}
+    assert set(reasons) == {"a2", "a3", "b2", "d1"}
+    assert reasons["a2"].startswith("it is a copy of a1")
+    assert reasons["a3"].startswith("it is given twice")
+    assert reasons["b2"].startswith("it is a copy of b1")
+    assert "its capture failed (camera lost)" in reasons["d1"]
 
 
 def test_command_writes_a_calibration(poses: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
