@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.bounded_files import read_small_text
+from scanner.calibration_id import id_warnings
 from scanner.covariance import read_covariance
 from scanner.credible import check_hall, check_response, check_slope, lens_warnings, pixel_warnings, rig_warnings
 from scanner.errors import CalibrationError
@@ -166,13 +167,14 @@ def load_calibration(path: Path) -> Calibration:
     """
     try:
         content = json.loads(read_small_text(path))
+        odd = id_warnings(content, path.name) if isinstance(content, dict) else []
     except OSError as error:
         raise CalibrationError(f"cannot read calibration {path}: {error.strerror}", hint=_MAKE) from error
     except (ValueError, RecursionError) as error:
         raise CalibrationError(f"{path} is not JSON: {error}", hint=_MAKE) from error
     found = calibration_from_dict(content, name=str(path))
     # Errors say where the file is; warnings go into reports, which are read elsewhere.
-    return replace(found, warnings=tuple(said.replace(str(path), path.name) for said in found.warnings))
+    return replace(found, warnings=(*(said.replace(str(path), path.name) for said in found.warnings), *odd))
 
 
 def calibration_from_dict(content: Any, name: str = "calibration") -> Calibration:

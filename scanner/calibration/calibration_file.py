@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 from collections.abc import Iterable, Sequence
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from scanner.calibration.problem import NAMES
 from scanner.calibration.solve import Solution
+from scanner.calibration_id import content_id
 from scanner.geometry import calibration_from_dict
 
 RIG_PARAMETERS = 24
@@ -55,12 +55,6 @@ def calibration_dict(solution: Solution, created: str | None = None) -> dict[str
     content = {key: content[key] for key in (*order, *(key for key in content if key not in order))}
     calibration_from_dict(content, name="the calibration found")
     return content
-
-
-def content_id(content: dict[str, Any]) -> str:
-    """16 hexadecimal digits of SHA-256 over everything but id and date: equal rigs have equal ids."""
-    plain = {key: value for key, value in content.items() if key not in ("id", "created")}
-    return hashlib.sha256(json.dumps(plain, sort_keys=True, separators=(",", ":")).encode()).hexdigest()[:16]
 
 
 def as_text(content: dict[str, Any]) -> str:

@@ -147,7 +147,8 @@ def _try(path: Path) -> None:
 
 
 def _write(path: Path, of_projector: dict[str, Any] | None) -> None:
-    from scanner.calibration.calibration_file import as_text, content_id  # noqa: PLC0415
+    from scanner.calibration.calibration_file import as_text  # noqa: PLC0415
+    from scanner.calibration_id import content_id  # noqa: PLC0415
     from scanner.errors import CalibrationError  # noqa: PLC0415
     from scanner.geometry import calibration_from_dict  # noqa: PLC0415
     from scanner.storage import replace_file  # noqa: PLC0415

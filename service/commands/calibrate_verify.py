@@ -89,6 +89,7 @@ def verify(
         from scanner.calibration.targets import parse_target  # noqa: PLC0415
         from scanner.calibration.verification import plain, repeatability  # noqa: PLC0415
         from scanner.calibration.verified import Wanted, verified  # noqa: PLC0415
+        from scanner.geometry import load_calibration  # noqa: PLC0415
         from scanner.scan import load_scan  # noqa: PLC0415
 
         wanted = Wanted(
@@ -112,6 +113,8 @@ def verify(
         document: dict[str, Any] = {"scans": results}
         if repeat:
             document["repeatability"] = _with_spread(plain(repeatability(clouds)))
+    for said in () if calibration is None else load_calibration(calibration).warnings:
+        print_error(said, label="warning")
     worst = _worst(document)
     document["largest_error_mm"] = worst
     if as_json:
@@ -154,8 +157,9 @@ def mcp(
         raise typer.BadParameter("--calibration FILE and -o FILE belong together")
     if output is not None and output.exists() and not force:
         raise typer.BadParameter(f"-o: {output} exists; --force replaces it")
-    from scanner.calibration.calibration_file import as_text, content_id  # noqa: PLC0415
+    from scanner.calibration.calibration_file import as_text  # noqa: PLC0415
     from scanner.calibration.mcp_phase import NOTABLE_PX, mcp_phase  # noqa: PLC0415
+    from scanner.calibration_id import content_id  # noqa: PLC0415
     from scanner.geometry import load_calibration  # noqa: PLC0415
     from scanner.storage import replace_file, try_file  # noqa: PLC0415
 

@@ -215,6 +215,14 @@ def test_command_writes_a_calibration(poses: Path, tmp_path: Path, capsys: pytes
     calibration = load_calibration(file)
     true = rig("quick").calibration
     assert calibration.id == document["calibration"]["id"] != ""
+    assert calibration.warnings == ()
+    copied = tmp_path / "copied.json"
+    copied.write_text(json.dumps(calibration.as_dict()))
+    assert load_calibration(copied).warnings == ()
+    copied.write_text(json.dumps({**calibration.as_dict(), "translation": [1.0, 240.0, 40.0]}))
+    assert any("copied.json: its id" in said and "edited by hand" in said for said in load_calibration(copied).warnings)
+    copied.write_text(json.dumps({**calibration.as_dict(), "translation": [1.0, 240.0, 40.0], "id": "mine"}))
+    assert not any("its id" in said for said in load_calibration(copied).warnings)
     assert np.linalg.norm(calibration.translation - true.translation) < 2.0
     assert calibration.phase_axis == "y"
     assert {one["name"] for one in document["left_out"]} == {"late", "bare", "rows"}
