@@ -37,9 +37,6 @@ SAMPLE = 4096
 ENOUGH = 1024
 """Pixels with light in them that a sample should have; larger ones are taken until it has, or there are no more."""
 
-LEAST_LIT = 100
-"""Of them, fewer than which tell nothing of the noise: the default model then stands as it is."""
-
 
 @dataclass(frozen=True)
 class GrayThresholds:
@@ -218,14 +215,15 @@ class GrayDecoder:
         kinds, levels = codes.kinds[0, : codes.coarse], codes.levels
         # The first axis's coarse bits: they have few borders of cells in them.
         addresses, size = codes.addresses[0, : codes.coarse], SAMPLE
-        noise = np.array([model.read, model.per_level, ROUNDING_VARIANCE, limit, self._camera.max_value], np.float32)
+        sigmas, most = self._thresholds.min_contrast_sigmas, self._camera.max_value
+        noise = np.array([model.read, model.per_level, ROUNDING_VARIANCE, limit, most, sigmas], np.float32)
         while True:
             starts, length = runs_of(self._pixels, size)
             lit, factor = noise_factor(addresses, kinds, levels, codes.like, starts, length, noise)
             if lit >= ENOUGH or size >= self._pixels:
                 break
             size *= 8
-        return float(factor) if lit >= LEAST_LIT else 1.0
+        return float(factor)
 
     # --- decoding -----------------------------------------------------------------------------------------------
 

@@ -1,11 +1,13 @@
 """How noisy Gray and binary code are, over what the default model says: from a sample of the coarse bits' images.
 
 An image and its inverse add up to the same in all bits; without inverses an image is as light as white or as dark as
-black. What they differ by is noise, of whatever the camera is.
+black. What they differ by is noise, of whatever the camera is. Where black cuts that off it says nothing of it
+(`scanner.decode.noise.CUT_SIGMAS`); how noisy the dark is, is told by pixels that are darker in white than in black.
 """
 
 from __future__ import annotations
 
+from math import erf, exp, pi, sqrt
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 from scanner.decode.addresses import expect_pixels, pixels_at
 from scanner.decode.graycode_bits import BOTH, INVERSE
 from scanner.decode.middles import nth_of
+from scanner.decode.noise import CUT_SIGMAS, FEWEST
 from scanner.kernel import kernel
 
 _HALF = np.float32(0.5)
@@ -33,13 +36,17 @@ def noise_factor(
     length: int,
     noise: NDArray[np.float32],
 ) -> tuple[int, float]:
-    """How many pixels of a sample have light in them, and the variance over that of the default model, of these.
+    """How many pixels of a sample have light in them, and the variance over that of the default model.
+
+    It is that of lit pixels, or of the dark ones if they have more; 1 or more where lit ones are fewer than FEWEST, or
+    black cuts all their noise off.
 
     Args:
         addresses: (bits, 2) of images and inverses; 0 where there is none. kinds: (bits,) PLAIN, INVERSE or BOTH.
         levels: (2,) of white and black, or zeros: bits then are all BOTH. like: (0,) array of the frames' dtype.
         starts, length: runs of pixels (`scanner.decode.runs`).
-        noise: [variance at level 0, variance per level, least variance, least contrast, largest grey level].
+        noise: [variance at level 0, variance per level, least variance, least contrast, largest grey level, least
+            contrast in sigmas].
     """
     bits, size = kinds.size, starts.size * length
     _expect_runs(addresses.reshape(-1), like, starts, length)
@@ -49,32 +56,87 @@ def noise_factor(
     for bit in range(bits):
         _take(addresses[bit, 0], like, starts, length, image[bit])
         _take(addresses[bit, 1], like, starts, length, inverse[bit])
+    dark = 0.0
     if levels[0] != 0:
         _take(levels[0], like, starts, length, white)
         _take(levels[1], like, starts, length, black)
+        dark = dark_factor(white, black, noise)
     else:
-        for bit in range(bits):
-            for i in range(size):
-                white[i] += max(image[bit, i], inverse[bit, i])
-                black[i] += min(image[bit, i], inverse[bit, i])
-        for i in range(size):
-            white[i], black[i] = white[i] / np.float32(bits), black[i] / np.float32(bits)
+        _levels_of_pairs(image, inverse, white, black)
     here = np.empty(size, np.int64)
     lit = 0
+    # What noise of the dark makes of white and black is no light.
+    least = max(noise[3], noise[5] * np.float32(sqrt(dark * noise[0])))
     for i in range(size):
         here[lit] = i
-        lit += 1 if white[i] - black[i] > noise[3] and white[i] < noise[4] else 0
-    if lit == 0:
-        return 0, 1.0
-    expected, quiet = np.empty(lit, np.float32), np.empty(lit, np.float32)
-    for n in range(lit):
-        both = white[here[n]] + black[here[n]]
-        expected[n] = max(noise[0] + noise[1] * (both * _HALF), noise[2])
-        quiet[n] = noise[2] / expected[n]
-    ratios = np.empty((bits, lit), np.float32)
-    for bit in range(bits):
-        _ratios(image[bit], inverse[bit], white, black, kinds[bit], levels[0] != 0, here, expected, ratios[bit])
-    return lit, _mean_square(ratios.reshape(-1), float(nth_of(quiet, lit // 2)))
+        lit += 1 if white[i] - black[i] > least and white[i] < noise[4] else 0
+    if lit < FEWEST:
+        return lit, max(dark, 1.0)
+    here = here[:lit]
+    ratios, quiet = np.empty(bits * lit, np.float32), np.empty(bits * lit, np.float32)
+    # Where black cuts depends on the noise: at first that of the model, then what the others show if it is more. The
+    # last round takes all, where black cuts all.
+    factor = 1.0
+    for turn in range(3):
+        limit = np.float32(CUT_SIGMAS**2 * max(factor, dark, 1.0)) if turn < 2 else np.float32(0)
+        count = 0
+        for bit in range(bits):
+            count += _ratios(
+                image[bit], inverse[bit], white, black, kinds[bit], levels[0] != 0, here, noise, limit,
+                ratios[count:], quiet[count:],
+            )  # fmt: skip
+        if count >= FEWEST:
+            seen = _mean_square(ratios[:count], float(nth_of(quiet[:count], count // 2)))
+            factor = seen if turn < 2 else max(factor, seen)
+            if turn == 1:
+                break
+    return lit, max(factor, dark)
+
+
+@kernel
+def dark_factor(white: NDArray[np.float32], black: NDArray[np.float32], noise: NDArray[np.float32]) -> float:
+    """The variance of the dark over that of the model; 0 where there are too few pixels that black cuts off.
+
+    Without light white is as often darker than black as brighter, and by as much: the half that is darker tells of
+    pixels without light alone, and with half of those that are alike, of all of these.
+    """
+    squares, order = np.empty(white.size, np.float32), 0
+    total, alike = 0.0, 0
+    for i in range(white.size):
+        off, both = white[i] - black[i], white[i] + black[i]
+        if off < 0:
+            squares[order] = off * off
+            order, total = order + 1, total + both * _HALF
+        elif off == 0 and white[i] < noise[4]:
+            alike, total = alike + 1, total + both * _HALF * _HALF
+    count = order + 0.5 * alike
+    if order < FEWEST:
+        return 0.0
+    variance = _mean_square(squares[:order], 0.0) * order / (2 * count)
+    mean = total / count
+    if mean * mean >= CUT_SIGMAS**2 * variance:
+        return 0.0
+    expected = max(float(noise[0]) + float(noise[1]) * mean, float(noise[2]))
+    return float(variance / _share_left(mean / sqrt(variance)) / expected)
+
+
+@kernel
+def _share_left(ratio: float) -> float:
+    """Of the variance of normal noise that ends at 0, what is left at this mean over 1-sigma, both as seen.
+
+    Source: Tobin 1958 (see CUT_SIGMAS). The mean before the cut is taken for 0 or more.
+    """
+    least, most, share = 0.0, CUT_SIGMAS, 1.0
+    for _ in range(12):
+        d = 0.5 * (least + most)
+        above, density = 0.5 * (1 + erf(d / sqrt(2.0))), exp(-0.5 * d * d) / sqrt(2 * pi)
+        mean = d * above + density
+        share = (d * d + 1) * above + d * density - mean * mean
+        if mean < ratio * sqrt(share):
+            least = d
+        else:
+            most = d
+    return share
 
 
 @kernel
@@ -96,6 +158,20 @@ def _take(address: int, like: NDArray[Any], starts: NDArray[np.intp], length: in
 
 
 @kernel
+def _levels_of_pairs(
+    image: NDArray[np.float32], inverse: NDArray[np.float32], white: NDArray[np.float32], black: NDArray[np.float32]
+) -> None:
+    """White and black from all bits' images and inverses."""
+    bits = np.float32(image.shape[0])
+    for bit in range(image.shape[0]):
+        for i in range(white.size):
+            white[i] += max(image[bit, i], inverse[bit, i])
+            black[i] += min(image[bit, i], inverse[bit, i])
+    for i in range(white.size):
+        white[i], black[i] = white[i] / bits, black[i] / bits
+
+
+@kernel
 def _ratios(
     image: NDArray[np.float32],
     inverse: NDArray[np.float32],
@@ -104,21 +180,41 @@ def _ratios(
     kind: int,
     has_levels: bool,
     here: NDArray[np.int64],
-    expected: NDArray[np.float32],
+    noise: NDArray[np.float32],
+    limit: np.float32,
     out: NDArray[np.float32],
-) -> None:
-    """Squares of what one bit's images show of noise, over what the model expects of it."""
+    quiet: NDArray[np.float32],
+) -> int:
+    """Squares of what one bit's images show of noise, over what the model expects of it; and the least they could be.
+
+    limit: of a grey level's square over its variance, below which its noise ends at black; those are left out.
+
+    Returns:
+        How many there are.
+    """
     of_pairs = np.float32(4 if has_levels else 3)
-    for n in range(out.size):
+    count = 0
+    for n in range(here.size):
         i = here[n]
         light, dark = white[i], black[i]
+        # A level's two samples together say how bright it is, and nothing of their difference.
         if kind == BOTH:
-            off = image[i] + inverse[i] - (light + dark)
-            out[n] = off * off / (of_pairs * expected[n])
+            off, parts = image[i] + inverse[i] - (light + dark), of_pairs
+            seen = (min(image[i], inverse[i]) + dark) * _HALF
         else:
             one = inverse[i] if kind == INVERSE else image[i]
-            off = min(abs(one - light), abs(one - dark))
-            out[n] = off * off / (np.float32(2) * expected[n])
+            above, below = abs(one - light), abs(one - dark)
+            off, parts = min(above, below), np.float32(2)
+            seen = (one + (light if above < below else dark)) * _HALF
+        variance = max(noise[0] + noise[1] * seen, noise[2])
+        if seen * seen < limit * variance:
+            continue
+        expected = variance
+        if kind == BOTH:
+            expected = max(noise[0] + noise[1] * ((light + dark) * _HALF), noise[2])
+        out[count], quiet[count] = off * off / (parts * expected), noise[2] / expected
+        count += 1
+    return count
 
 
 @kernel

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from scanner.decode import Reason, decoder_for
 from scanner.decode.graycode import GrayDecoder
+from scanner.decode.graycode_noise import dark_factor
 from scanner.decode.noise import default_noise
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, PmpPattern, ProjectorSize
@@ -194,21 +195,32 @@ def test_what_blur_leaves_of_the_code_is_coarse_undecided_and_said(code, sigma_p
 
 
 def plain_noise_factor(sequence, frames, white, black, model):
-    """What the first axis's coarse images say of noise, of all pixels of a small capture: squares within 3 sigmas."""
+    """What the first axis's coarse images say of noise, of all pixels of a small capture: squares within 3 sigmas.
+
+    Levels that are lower than 2.5 sigmas, as found in a first round, are left out.
+    """
     bits, each = sequence.pattern.bits, sequence.pattern.frames_per_bit
-    expected = model.variance(((white + black) / 2).astype(np.float32))
-    ratios = []
+    ratios, seen, expected = [], [], []
     for bit in range((bits + 1) // 2):
         images = [frames[sequence.fringes[bit * each + n]].astype(float) for n in range(each)]
         if each == 2:
             terms = 3 if sequence.white is None else 4
-            ratios.append((sum(images) - white - black) ** 2 / (terms * expected))
+            off, level = sum(images) - white - black, (np.minimum(*images) + black) / 2
+            expected.append(model.variance(((white + black) / 2).astype(np.float32)))
         else:
-            nearest = np.minimum(np.abs(images[0] - white), np.abs(images[0] - black))
-            ratios.append(nearest**2 / (2 * expected))
-    ratios = np.array(ratios)
-    within = ratios <= 9 * max(np.median(ratios) / 0.455, np.median(1 / 12 / expected))
-    return ratios[within].mean() / 0.973
+            nearest = np.where(np.abs(images[0] - white) < np.abs(images[0] - black), white, black)
+            terms, off, level = 2, images[0] - nearest, (images[0] + nearest) / 2
+            expected.append(model.variance(level.astype(np.float32)))
+        ratios.append(off**2 / (terms * expected[-1]))
+        seen.append(level**2 / model.variance(level.astype(np.float32)))
+    ratios, seen, expected = np.array(ratios), np.array(seen), np.array(expected)
+    factor = 1.0
+    for _ in range(2):
+        whole = seen >= 2.5**2 * max(factor, 1.0)
+        kept = ratios[whole]
+        within = kept <= 9 * max(np.median(kept) / 0.455, np.median(1 / 12 / expected[whole]))
+        factor = kept[within].mean() / 0.973
+    return factor
 
 
 @pytest.mark.parametrize(("inverse", "levels"), [(True, False), (True, True), (False, True)])
@@ -223,6 +235,36 @@ def test_noise_is_that_of_the_plain_form(inverse, levels):
         white, black = pairs.max(axis=1).mean(axis=0), pairs.min(axis=1).mean(axis=0)
     expected = plain_noise_factor(sequence, frames, white, black, default_noise(255))
     assert decode(sequence, frames.items(), camera).details["noise_factor"] == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("noise", [1.5, 2.0, 8.0])
+def test_noise_that_black_cuts_off_is_told_by_what_is_left(noise):
+    rng, model = np.random.default_rng(3), default_noise(255)
+    for level in (0, noise):
+        white, black = (np.rint(np.maximum(rng.normal(level, noise, 8192), 0)).astype(np.float32) for _ in range(2))
+        of_model = np.array([model.read, model.per_level, 1 / 12, 3, 255, 8], np.float32)
+        expected = (noise**2 + 1 / 12) / model.variance(np.float32(level))
+        assert dark_factor(white, black, of_model) == pytest.approx(expected, rel=0.3)
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_where_there_is_no_light_there_are_no_values(inverse):
+    # Noise of twice the model's sigma, of which black leaves half: what is left of it passed for bits.
+    camera = CameraFormat(320, 240)
+    sequence = sequence_of(GrayPattern(("y",), 6, 8, inverse=inverse), True)
+    for albedo in (0.0, 0.01):
+        found = decode(sequence, take(sequence, camera, albedo=albedo, ambient=0, noise=0.008), camera)
+        assert found.details["noise_factor"] > 1
+        assert not np.isfinite(found.rows).any()
+        if albedo == 0:
+            assert (found.reason == Reason.SHADOW).all()
+
+
+def test_noise_is_never_below_the_model_where_black_cuts_all_of_it():
+    camera = CameraFormat(64, 60)
+    sequence = sequence_of(GrayPattern(("x",), 8, 9, inverse=True), False)
+    found = decode(sequence, take(sequence, camera, ambient=0, noise=0.001), camera)
+    assert found.details["noise_factor"] == 1
 
 
 def test_pixels_too_dim_to_tell_accuse_no_blur():
