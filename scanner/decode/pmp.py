@@ -146,12 +146,13 @@ class PmpDecoder:
             whole = self.finish()
             return Coordinates(whole.rows, whole.columns, whole.confidence, whole.warnings)
         warnings, (axis,) = self._missing(), self._pattern.axes
-        found = self._decoded_axis(axis, brief=True)
+        found = self._decoded_in_step(axis, brief=True)
         self._require_fringes(axis, found)
         shape = self._camera.shape
         position, confidence = found.maps.position.reshape(shape), found.maps.confidence.reshape(shape)
         rows, columns = (position, None) if axis == "y" else (None, position)
-        return Coordinates(rows, columns, confidence, warnings + disagreements(axis, found.remainders))
+        warnings = (*self._doubled, *warnings, *disagreements(axis, found.remainders))
+        return Coordinates(rows, columns, confidence, warnings)
 
     def _took(self, fringe: int, frame: NDArray[Any]) -> None:
         self._frames[fringe] = frame
@@ -181,8 +182,12 @@ class PmpDecoder:
         return tuple(warnings)
 
     def _decode(self, axis: Axis) -> None:
-        found = self._decoded_axis(axis, brief=False)
-        self._found[axis] = self._decoded_axis(axis, brief=False) if self._without_doubled(axis, found) else found
+        self._found[axis] = self._decoded_in_step(axis, brief=False)
+
+    def _decoded_in_step(self, axis: Axis, brief: bool) -> AxisFound:
+        """Decode one axis, without the frames of it that are found to show what others show."""
+        found = self._decoded_axis(axis, brief)
+        return self._decoded_axis(axis, brief) if self._without_doubled(axis, found) else found
 
     def _without_doubled(self, axis: Axis, found: AxisFound) -> bool:
         """Leave doubled frames out, and keep what is to be said of them; whether any was left out."""

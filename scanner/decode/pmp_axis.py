@@ -173,7 +173,7 @@ class AxisFound:
     counts: NDArray[np.int64]
     """(REASONS,) pixels by reason"""
     may_be_doubled: bool
-    """residuals are large enough for one frame to show what another one shows; False where nobody asks"""
+    """residuals are large enough for one frame to show what another one shows"""
     sample: Sample
 
 
@@ -253,7 +253,7 @@ def decode_axis(
             counts += changes
     return AxisFound(
         maps, plan.ladder, noise, found, settled, off_surface, ripple, light, random_px, counts,
-        not brief and may_be_doubled(noise, sample.mean.reshape(-1), sample.modulations[finest].reshape(-1), frames),
+        may_be_doubled(noise, sample.mean.reshape(-1), sample.modulations[finest].reshape(-1), frames),
         sample,
     )  # fmt: skip
 

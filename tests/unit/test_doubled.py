@@ -28,12 +28,12 @@ def captured(shifts, seed=0, noise=1.0, lit=1.0, gain=200.0):
     return sequence, frames, rows
 
 
-def decoded(sequence, frames, without=()):
+def decoded(sequence, frames, without=(), brief=False):
     decoder = decoder_for(sequence, CAMERA)
     for position, frame in enumerate(frames):
         if position not in without:
             decoder.add(position, frame)
-    return decoder.finish()
+    return decoder.coordinates() if brief else decoder.finish()
 
 
 @pytest.mark.parametrize("shifts", [5, 8, 16])
@@ -49,6 +49,17 @@ def test_a_doubled_frame_is_named_and_left_out(shifts, fresh):
     off = np.abs(found.rows - rows)[:, 2:-2] / found.sigma_rows[:, 2:-2]
     assert 0.92 < np.nanmean(off < 2) < 0.98
     assert np.isfinite(off).mean() > 0.99
+
+
+@pytest.mark.parametrize("shifts", [3, 4, 5])
+def test_coordinates_alone_are_those_of_the_whole_answer(shifts):
+    sequence, frames, _ = captured(shifts)
+    frames[shifts + 1] = frames[shifts]
+    whole, brief = decoded(sequence, frames), decoded(sequence, frames, brief=True)
+    assert "capture again" in whole.warnings[0]
+    assert brief.warnings[0] == whole.warnings[0]
+    np.testing.assert_array_equal(brief.rows, whole.rows)
+    np.testing.assert_array_equal(brief.confidence, whole.confidence)
 
 
 def test_of_four_shifts_both_are_named_and_of_three_those_that_are_one_picture():
