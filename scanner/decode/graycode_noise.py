@@ -88,7 +88,7 @@ def noise_factor(
         if count >= FEWEST:
             seen = _mean_square(ratios[:count], float(nth_of(quiet[:count], count // 2)))
             factor = seen if turn < 2 else max(factor, seen)
-            if turn == 1:
+            if turn == 1 or factor <= max(dark, 1.0):
                 break
     return lit, max(factor, dark)
 
