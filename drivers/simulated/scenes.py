@@ -26,7 +26,7 @@ X, Y, Z = np.eye(3)
 class Material:
     """How a body reflects. albedo 0..1, or a picture printed on a rectangle."""
 
-    albedo: float | textures.Picture
+    albedo: float | textures.Print
     gloss: float = 0.0
 
 
@@ -164,7 +164,7 @@ def _wedge() -> Scene:
     bodies = np.stack([rectangle(p.centre, p.u, p.v, *p.half) for p in planes])
     discs = reference()["scenes"]["wedge"]["discs"]
     radius, inside = float(discs["radius_mm"]), float(discs["albedo"])
-    printed = (textures.discs(p.disc_centres, radius, inside, _albedo(), p.half) for p in planes)
+    printed = (textures.Discs(p.disc_centres, radius, inside, _albedo()) for p in planes)
     return Scene(bodies, tuple(Material(picture) for picture in printed))
 
 

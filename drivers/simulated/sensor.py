@@ -47,25 +47,27 @@ def sense(
     electrons: float,
     dn_per_electron: float,
     read_noise_e: float | None,
-    key: tuple[int, int],
+    key: tuple[int, ...],
     out: NDArray[np.uint8] | NDArray[np.uint16],
     max_value: int,
 ) -> None:
     """Turn light on the sensor into grey levels.
 
     Args:
-        light: (H, W) float32.
-        taps: see `blur_taps`.
+        light: (H + 2 m, W + 2 m) float32: what falls beside the sensor, too, as far as the lens blurs it onto it.
+        taps: see `blur_taps`; `len(taps) - 1` is m or less.
         electrons: that light 1 frees in this exposure.
         dn_per_electron: grey levels per electron.
         read_noise_e: rms, electrons; None: no noise at all.
-        key: seed and number of the frame.
+        key: of the frame's noise: seed, number, whatever else tells it from others.
         out: (H, W), filled; saturates at `max_value`.
         max_value: largest grey level.
     """
-    rows, signs = _places(key, light.shape[0])
-    rolling = np.empty((2 * len(taps) - 1, light.shape[1]), dtype=np.float32)
-    line = np.empty(light.shape[1], dtype=np.float32)
+    if min(light.shape[0] - out.shape[0], light.shape[1] - out.shape[1]) < 2 * (len(taps) - 1):
+        raise ValueError(f"light of {light.shape} px does not reach as far around {out.shape} px as the lens blurs")
+    rows, signs = _places(key, out.shape[0])
+    rolling = np.empty((2 * len(taps) - 1, out.shape[1]), dtype=np.float32)
+    line = np.empty(out.shape[1], dtype=np.float32)
     variance = 0.0 if read_noise_e is None else read_noise_e**2
     noisy = np.float32(0.0 if read_noise_e is None else 1.0)
     _sense(
@@ -85,7 +87,7 @@ def sense(
     )
 
 
-def _places(key: tuple[int, int], height: int) -> tuple[NDArray[np.int64], Plane]:
+def _places(key: tuple[int, ...], height: int) -> tuple[NDArray[np.int64], Plane]:
     """Where in the table each row begins, and its sign: a counter-based generator (splitmix64, Steele et al. 2014)."""
     with np.errstate(over="ignore"):
         z = np.arange(height, dtype=np.uint64) + np.uint64(1)
@@ -104,21 +106,21 @@ def _mix(z: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 @kernel
 def _sense(light, taps, electrons, dn, variance, noisy, table, starts, signs, top, rolling, line, out):
-    height, width = light.shape
+    height, width = out.shape
     reach = taps.shape[0] - 1
+    margin = (light.shape[0] - height) // 2
     span = 2 * reach + 1
     half, zero = np.float32(0.5), np.float32(0.0)
-    for r in range(-reach, height):
+    for r in range(-2 * reach, height):
         fresh = r + reach
-        if fresh < height:
-            _blur_row(light[fresh], taps, rolling[fresh % span])
+        _blur_row(light[fresh + margin], taps, rolling[fresh % span])
         if r < 0:
             continue
         middle = rolling[r % span]
         for c in range(width):
             line[c] = taps[0] * middle[c]
         for k in range(1, reach + 1):
-            above, below = rolling[max(r - k, 0) % span], rolling[min(r + k, height - 1) % span]
+            above, below = rolling[(r - k) % span], rolling[(r + k) % span]
             tap = taps[k]
             for c in range(width):
                 line[c] += tap * (above[c] + below[c])
@@ -133,23 +135,19 @@ def _sense(light, taps, electrons, dn, variance, noisy, table, starts, signs, to
 
 @kernel
 def _blur_row(source, taps, result):
-    width = source.shape[0]
-    reach = taps.shape[0] - 1
+    width = result.shape[0]
+    margin = (source.shape[0] - width) // 2
     for c in range(width):
-        result[c] = taps[0] * source[c]
-    edge = min(reach, width)
-    for k in range(1, reach + 1):
+        result[c] = taps[0] * source[c + margin]
+    for k in range(1, taps.shape[0]):
         tap = taps[k]
-        for c in range(edge, width - edge):
-            result[c] += tap * (source[c - k] + source[c + k])
-        for c in range(edge):
-            result[c] += tap * (source[max(c - k, 0)] + source[min(c + k, width - 1)])
-        for c in range(max(width - edge, edge), width):
-            result[c] += tap * (source[max(c - k, 0)] + source[min(c + k, width - 1)])
+        left, right = source[margin - k : margin - k + width], source[margin + k : margin + k + width]
+        for c in range(width):
+            result[c] += tap * (left[c] + right[c])
 
 
 def warm_up() -> None:
     """Compile the kernel for both pixel formats (or load it from its cache)."""
-    light = np.zeros((8, 16), dtype=np.float32)
+    light = np.zeros((14, 22), dtype=np.float32)
     for out in (np.empty((8, 16), dtype=np.uint8), np.empty((8, 16), dtype=np.uint16)):
         sense(light, blur_taps(0.7), 1000.0, 0.01, 1.0, (0, 0), out, 255)

@@ -17,7 +17,8 @@ from drivers.simulated.rigs import REFERENCE_AIM_MM, Rig, reference
 Array = NDArray[np.float64]
 
 SQUARE_MM = 30.0
-PX_PER_SQUARE = 120
+CELLS_PER_SQUARE = 8
+"""Of the print: a ChArUco marker's module is an eighth of a square"""
 MARGIN_SQUARES = 0.5
 """White paper around the squares"""
 
@@ -53,14 +54,16 @@ class PrintedTarget:
 
     def texture(self, square_mm: float) -> textures.Picture:
         """Albedo over the paper; square_mm: side of a square in the texture's own coordinates."""
-        size = (self.columns * PX_PER_SQUARE, self.rows * PX_PER_SQUARE)
+        size = (self.columns * CELLS_PER_SQUARE, self.rows * CELLS_PER_SQUARE)
         if self.charuco:
-            black = charuco_board().generateImage(size) < 128
+            # Drawn larger, and read at the cells' middles: how OpenCV rounds small drawings is of no concern.
+            fine = charuco_board().generateImage((size[0] * 15, size[1] * 15))
+            black = fine[7::15, 7::15] < 128
         else:
-            y, x = np.indices((size[1], size[0])) // PX_PER_SQUARE
+            y, x = np.indices((size[1], size[0])) // CELLS_PER_SQUARE
             black = (x + y) % 2 == 0
         picture = np.where(black, np.float32(self.dark), np.float32(self.white))
-        return textures.Picture(picture, square_mm / PX_PER_SQUARE, around=self.white)
+        return textures.Picture(picture, square_mm / CELLS_PER_SQUARE, around=self.white)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +88,7 @@ POSED = {
 def charuco_board() -> cv2.aruco.CharucoBoard:
     """The ChArUco board of `charuco_poses`: 10 x 7 squares of 30 mm, markers of 22.5 mm from DICT_4X4_50.
 
-    A marker's module is then an eighth of a square, a whole number of pixels of the drawing.
+    A marker's module is then an eighth of a square.
     """
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     return cv2.aruco.CharucoBoard((10, 7), SQUARE_MM, SQUARE_MM * 0.75, dictionary)

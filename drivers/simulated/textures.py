@@ -1,6 +1,6 @@
 """Albedo over a flat body, as printed pictures: samplers, chequers, discs, targets.
 
-A camera pixel sees the mean over its footprint: the picture is sampled SUBSAMPLES x SUBSAMPLES times within it.
+A camera pixel sees the mean over its footprint, by exact areas (`coverage`). The lens blurs afterwards (`sensor`).
 """
 
 # Kernels: numba types their arguments.
@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.simulated.coverage import disc_share, raster_mean
 from scanner.kernel import kernel
 
 Array = NDArray[np.float64]
 
-SUBSAMPLES = 4
 DARK, BRIGHT = 0.05, 0.9
 PX_PER_MM = 4
 
@@ -34,6 +34,19 @@ class Picture:
     mm_per_px: float
     tiled: bool = False
     around: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Discs:
+    """Discs on a plain ground. centres: (N, 2) float64 mm from the middle of the rectangle; no two overlap."""
+
+    centres: Array
+    radius_mm: float
+    inside: float
+    around: float
+
+
+Print = Picture | Discs
 
 
 def sampler() -> Picture:
@@ -55,24 +68,8 @@ def chequer(dark: float, bright: float, side_mm: float = 100.0) -> Picture:
     return Picture(np.array([[dark, bright], [bright, dark]], dtype=np.float32), side_mm, tiled=True)
 
 
-def discs(centres: Array, radius_mm: float, inside: float, outside: float, half_mm: tuple[float, float]) -> Picture:
-    """Discs on a plain ground; centres: (N, 2) mm from the middle; half_mm: half extents of the ground."""
-    fine = 4 * PX_PER_MM
-    width, height = (int(np.ceil(2 * half * PX_PER_MM / 2)) * 2 for half in half_mm)
-    values = np.full((height, width), outside, dtype=np.float32)
-    for x, y in centres:
-        # The pixels around one disc, each the mean of 4 x 4 samples: its outline is exact to 1/16 mm.
-        left, top = int((x - radius_mm) * PX_PER_MM + width / 2) - 1, int((y - radius_mm) * PX_PER_MM + height / 2) - 1
-        size = int(2 * radius_mm * PX_PER_MM) + 4
-        at = (np.arange(size * 4) + 0.5) / fine
-        u, v = at + (left - width / 2) / PX_PER_MM - x, at + (top - height / 2) / PX_PER_MM - y
-        covered = (u[None, :] ** 2 + v[:, None] ** 2 < radius_mm**2).reshape(size, 4, size, 4).mean(axis=(1, 3))
-        values[top : top + size, left : left + size] = outside + (inside - outside) * covered
-    return Picture(values, 1 / PX_PER_MM, around=outside)
-
-
 def footprint_albedo(
-    picture: Picture,
+    picture: Print,
     rectangle: Array,
     body: NDArray[np.int32],
     index: int,
@@ -93,19 +90,13 @@ def footprint_albedo(
         shape: (H, W) of the pixels.
         albedo: (N,) set in place.
     """
-    _footprints(
-        picture.values,
-        picture.mm_per_px,
-        picture.tiled,
-        np.float32(picture.around),
-        rectangle,
-        body,
-        index,
-        directions,
-        origin,
-        shape[1],
-        albedo,
-    )
+    rays = (rectangle, body, index, directions, origin, shape[1], albedo)
+    if isinstance(picture, Discs):
+        centres = np.ascontiguousarray(picture.centres, dtype=np.float64)
+        _footprints_discs(centres, picture.radius_mm, picture.inside, picture.around, *rays)
+    else:
+        around = np.float32(picture.around)
+        _footprints(picture.values, picture.mm_per_px, picture.tiled, around, *rays)
 
 
 def _squares(u: Array, v: Array, side: float) -> NDArray[np.bool_]:
@@ -147,29 +138,46 @@ def _print() -> NDArray[np.float32]:
 
 @kernel
 def _footprints(values, mm_per_px, tiled, around, rectangle, body, index, directions, origin, width, albedo):
-    count = directions.shape[0]
     height_px, width_px = values.shape
-    for i in range(count):
+    for i in range(directions.shape[0]):
         if body[i] != index:
             continue
-        u, v = _on_rectangle(rectangle, directions[i], origin)
-        beside = i + 1 if (i + 1) % width else i - 1
-        below = i + width if i + width < count else i - width
-        u1, v1 = _on_rectangle(rectangle, directions[beside], origin)
-        u2, v2 = _on_rectangle(rectangle, directions[below], origin)
-        total = np.float32(0.0)
-        for a in range(SUBSAMPLES):
-            for b in range(SUBSAMPLES):
-                s, t = (a + 0.5) / SUBSAMPLES - 0.5, (b + 0.5) / SUBSAMPLES - 0.5
-                c = int(np.floor((u + s * (u1 - u) + t * (u2 - u)) / mm_per_px + 0.5 * width_px))
-                r = int(np.floor((v + s * (v1 - v) + t * (v2 - v)) / mm_per_px + 0.5 * height_px))
-                if tiled:
-                    total += values[r % height_px, c % width_px]
-                elif 0 <= r < height_px and 0 <= c < width_px:
-                    total += values[r, c]
-                else:
-                    total += around
-        albedo[i] = total / np.float32(SUBSAMPLES * SUBSAMPLES)
+        u, v, ax, ay, bx, by = _footprint(rectangle, directions, origin, width, i)
+        albedo[i] = raster_mean(
+            values,
+            tiled,
+            around,
+            u / mm_per_px + 0.5 * width_px,
+            v / mm_per_px + 0.5 * height_px,
+            ax / mm_per_px,
+            ay / mm_per_px,
+            bx / mm_per_px,
+            by / mm_per_px,
+        )
+
+
+@kernel
+def _footprints_discs(centres, radius, inside, around, rectangle, body, index, directions, origin, width, albedo):
+    for i in range(directions.shape[0]):
+        if body[i] != index:
+            continue
+        u, v, ax, ay, bx, by = _footprint(rectangle, directions, origin, width, i)
+        share = 0.0
+        for n in range(centres.shape[0]):
+            share += disc_share(u - centres[n, 0], v - centres[n, 1], ax, ay, bx, by, radius)
+        albedo[i] = around + (inside - around) * share
+
+
+@kernel
+def _footprint(rectangle, directions, origin, width, i):
+    """Middle and sides, mm, of what pixel i covers of the rectangle's plane: as far as to its neighbours' middles."""
+    count = directions.shape[0]
+    u, v = _on_rectangle(rectangle, directions[i], origin)
+    beside = i + 1 if (i + 1) % width else i - 1
+    below = i + width if i + width < count else i - width
+    u1, v1 = _on_rectangle(rectangle, directions[beside], origin)
+    u2, v2 = _on_rectangle(rectangle, directions[below], origin)
+    return u, v, u1 - u, v1 - v, u2 - u, v2 - v
 
 
 @kernel
@@ -189,4 +197,5 @@ def warm_up() -> None:
     square = np.array([0.0, 0, 0, 9, 1, 0, 0, 0, 1, 0, 0, 0, 1, 5, 5, 0])
     rays = np.array([[0.0, 0.0, 1.0]] * 4)
     body, albedo = np.zeros(4, dtype=np.int32), np.zeros(4, dtype=np.float32)
-    footprint_albedo(chequer(0.1, 0.9), square, body, 0, rays, np.zeros(3), (2, 2), albedo)
+    for picture in (chequer(0.1, 0.9), Discs(np.zeros((1, 2)), 1.0, 0.1, 0.9)):
+        footprint_albedo(picture, square, body, 0, rays, np.zeros(3), (2, 2), albedo)

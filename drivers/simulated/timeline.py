@@ -163,11 +163,16 @@ def pulsed_response(response: Plane, manner: Manner, segment: Segment, start_ns:
     return np.asarray(on / (end_ns - start_ns), dtype=np.float32)
 
 
-def bands(start_ns: float, readout_ns: float, height: int, count: int) -> Iterator[tuple[slice, float]]:
-    """Bands of rows of a rolling exposure that are taken as exposed together: rows, and their start, ns."""
+def bands(start_ns: float, readout_ns: float, height: int, margin: int, count: int) -> Iterator[tuple[slice, float]]:
+    """Bands of rows of a rolling exposure that are taken as exposed together: rows, and their start, ns.
+
+    height: of the sensor. margin: rows above and below it, which are exposed with the first and the last band.
+    """
     edges = np.linspace(0, height, min(count, height) + 1).astype(int)
     for low, high in pairwise(edges):
-        yield slice(int(low), int(high)), start_ns + readout_ns * ((low + high - 1) / 2) / max(height - 1, 1)
+        begin = start_ns + readout_ns * ((low + high - 1) / 2) / max(height - 1, 1)
+        rows = slice(int(low) + margin if low else 0, int(high) + (margin if high < height else 2 * margin))
+        yield rows, begin
 
 
 def _pulse_time(response: Plane, manner: Manner, t_ns: float) -> NDArray[np.float64]:

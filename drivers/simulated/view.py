@@ -18,7 +18,7 @@ from drivers.simulated.cast import Hits, cast_rays, lit_points
 from drivers.simulated.optics import Optics, Plane
 from drivers.simulated.rigs import Rig
 from drivers.simulated.scenes import Scene, SceneOptions, build_scene
-from drivers.simulated.textures import Picture, footprint_albedo
+from drivers.simulated.textures import Discs, Picture, footprint_albedo
 from scanner.devices import Truth
 from scanner.geometry import Lens
 from scanner.kernel import kernel
@@ -31,8 +31,9 @@ GLOSS_EXPONENT = 40.0
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A scene as the camera's pixels see it, all (H, W).
+    """A scene as the camera sees it, all (H + 2 margin, W + 2 margin); the truth is of its pixels alone, (H, W).
 
+    Beyond its pixels lies what the lens blurs onto them: `margin` px of it on each side.
     row, column: float32 projector coordinates + 0.5 (so the picture begins at 0), 0 where not lit. shade: reflected
     light for full-on light, in shares of what a white facing plane at the aim point would reflect; 0 where not lit.
     floor: reflected ambient light in the same unit.
@@ -43,11 +44,12 @@ class View:
     shade: Plane
     floor: Plane
     truth: Truth
+    margin: int
 
 
-def view_scene(rig: Rig, scene: Scene, optics: Optics, stride: int = 1) -> View:
-    """Cast and shade a scene; stride > 1 looks at every stride-th pixel only."""
-    grid = rig.calibration.camera.pixel_grid()[::stride, ::stride]
+def view_scene(rig: Rig, scene: Scene, optics: Optics, stride: int = 1, margin: int = 0) -> View:
+    """Cast and shade a scene; stride > 1 looks at every stride-th pixel only. margin: see `View`."""
+    grid = _pixels(rig.calibration.camera, stride, margin)
     shape = grid.shape[:2]
     directions = _directions(rig.calibration.camera, grid)
     origin = rig.to_scene(np.zeros(3))
@@ -55,7 +57,7 @@ def view_scene(rig: Rig, scene: Scene, optics: Optics, stride: int = 1) -> View:
     light = rig.to_scene(rig.calibration.projector_centre)
     lit = lit_points(origin, directions, hits, light, scene.bodies, scene.field)
     albedo = _albedo(scene, hits, directions, origin, shape)
-    return _shaded(rig, scene, optics, directions, hits, lit, albedo, shape)
+    return _shaded(rig, scene, optics, directions, hits, lit, albedo, shape, margin)
 
 
 def white_level(rig: Rig, optics: Optics) -> float:
@@ -66,6 +68,12 @@ def white_level(rig: Rig, optics: Optics) -> float:
     stride = max(1, rig.calibration.camera.size[0] // 160)
     board = view_scene(rig, build_scene("board", SceneOptions(), rig, 0), optics, stride)
     return float(np.percentile(board.shade + board.floor, 99))
+
+
+def _pixels(camera: Lens, stride: int, margin: int) -> Array:
+    """(H, W, 2) x, y of the pixels' centres, those beyond the picture's borders included."""
+    x, y = (np.arange(-margin, n + margin, stride, dtype=np.float64) for n in camera.size)
+    return np.stack(np.meshgrid(x, y), axis=-1)
 
 
 def _directions(camera: Lens, grid: Array) -> Array:
@@ -81,10 +89,10 @@ def _directions(camera: Lens, grid: Array) -> Array:
 
 def _albedo(scene: Scene, hits: Hits, directions: Array, origin: Array, shape: tuple[int, ...]) -> Plane:
     """(N,) float32 albedo of what each pixel sees, averaged over its footprint where it is printed."""
-    plain = [0.0 if isinstance(m.albedo, Picture) else m.albedo for m in scene.materials]
+    plain = [0.0 if isinstance(m.albedo, Picture | Discs) else m.albedo for m in scene.materials]
     albedo = np.append(np.asarray(plain, dtype=np.float32), np.float32(0.0))[hits.body]
     for index, material in enumerate(scene.materials):
-        if isinstance(material.albedo, Picture):
+        if isinstance(material.albedo, Picture | Discs):
             footprint_albedo(material.albedo, scene.bodies[index], hits.body, index, directions, origin, shape, albedo)
     return albedo
 
@@ -98,6 +106,7 @@ def _shaded(
     lit: NDArray[np.bool_],
     albedo: Plane,
     shape: tuple[int, ...],
+    margin: int,
 ) -> View:
     calibration = rig.calibration
     projector = calibration.projector
@@ -123,8 +132,14 @@ def _shaded(
         xyz,
     )
     row, column, shade, floor, rows, columns = (plane.reshape(shape) for plane in planes)
-    truth = Truth(rows=rows, columns=columns, xyz=xyz.reshape(*shape, 3), lit=lit.reshape(shape))
-    return View(row, column, shade, floor, truth)
+    own = np.s_[margin : shape[0] - margin, margin : shape[1] - margin]
+    truth = Truth(
+        rows=np.ascontiguousarray(rows[own]),
+        columns=np.ascontiguousarray(columns[own]),
+        xyz=np.ascontiguousarray(xyz.reshape(*shape, 3)[own]),
+        lit=np.ascontiguousarray(lit.reshape(shape)[own]),
+    )
+    return View(row, column, shade, floor, truth, margin)
 
 
 @kernel

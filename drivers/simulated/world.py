@@ -114,7 +114,18 @@ class World:
         options = s.scene_options
         if self._steps:
             options = replace(options, pose=(options.pose + self._steps) % POSES)
-        return _view(s.rig, s.scene, options, seed, o.projector_falloff, o.vignetting, o.ambient)
+        margin = len(self._taps) - 1
+        return _view(s.rig, s.scene, options, seed, o.projector_falloff, o.vignetting, o.ambient, margin)
+
+    @property
+    def _pose(self) -> tuple[int, ...]:
+        """Of a printed target, for its noise: captures of poses, each by devices opened anew, count frames from 0."""
+        s = self.settings
+        return (s.scene_options.pose,) if s.scene in POSED and s.scene_options.pose else ()
+
+    @cached_property
+    def _taps(self) -> Plane:
+        return blur_taps(self.settings.optics.camera_blur_sigma_px)
 
     def sequence_over(self) -> None:
         """A sequence was shown and will not be shown again: a target that walks goes to its next pose."""
@@ -146,7 +157,7 @@ class World:
             readout_ns: from the first row's start to the last row's; 0 for a global shutter.
             gain_db: of the camera.
             bits: of `out`.
-            number: of the frame: the key of its noise.
+            number: of the frame: the key of its noise, with the pose that the world began in.
             out: (H, W), filled.
         """
         optics = self.settings.optics
@@ -154,17 +165,20 @@ class World:
         gain = 10.0 ** (gain_db / 20.0)
         sense(
             self.arriving(start_ns, exposure_ns, readout_ns),
-            blur_taps(optics.camera_blur_sigma_px),
+            self._taps,
             electrons=self.electrons_per_light * exposure_ns / NOMINAL_EXPOSURE_NS,
             dn_per_electron=gain * top / optics.full_well_e,
             read_noise_e=optics.read_noise_dn * optics.full_well_e / 255.0 if optics.noise else None,
-            key=(self.settings.shared.seed, number),
+            key=(self.settings.shared.seed, number, *self._pose),
             out=out,
             max_value=top,
         )
 
     def arriving(self, start_ns: int, exposure_ns: int, readout_ns: int) -> Plane:
-        """(H, W) float32: mean light on the sensor over each row's exposure; valid until the next call."""
+        """Mean light on the sensor over each row's exposure, and beside it (`View.margin`), float32.
+
+        Valid until the next call. What falls beside the sensor is exposed with the row that it is blurred onto.
+        """
         end_ns = start_ns + readout_ns + exposure_ns
         segments = self.timeline.between(start_ns, end_ns)
         manner = self.timeline.manner
@@ -202,8 +216,9 @@ class World:
     ) -> None:
         """Rows of the camera, or of the projector, change at times of their own."""
         view, manner = self.view, self.timeline.manner
-        height = out.shape[0]
-        begin = start_ns + readout_ns * np.arange(height)[:, None] / max(height - 1, 1)
+        height = self.rig.calibration.camera.size[1]
+        row = np.clip(np.arange(out.shape[0]) - view.margin, 0, height - 1)
+        begin = start_ns + readout_ns * row[:, None] / max(height - 1, 1)
         down = view.row / np.float32(self.rig.calibration.projector.size[1]) if manner.sweep_ns else np.zeros((1, 1))
         np.copyto(out, view.floor)
         for segment in segments:
@@ -219,7 +234,8 @@ class World:
         view, manner = self.view, self.timeline.manner
         np.copyto(out, view.floor)
         count = PULSE_BANDS if readout_ns else 1
-        for rows, begin in timeline.bands(start_ns, readout_ns, out.shape[0], count):
+        height = self.rig.calibration.camera.size[1]
+        for rows, begin in timeline.bands(start_ns, readout_ns, height, view.margin, count):
             for segment in segments:
                 if segment.image is None:
                     continue
@@ -251,11 +267,12 @@ def _view(
     falloff: float,
     vignetting: float,
     ambient: float,
+    margin: int,
 ) -> View:
     """A view, kept for the worlds that follow: a rig's daemon opens the same scene again and again."""
     optics = Optics(projector_falloff=falloff, vignetting=vignetting, ambient=ambient)
     chosen = rig(rig_name)
-    return view_scene(chosen, build_scene(scene, options, chosen, seed), optics)
+    return view_scene(chosen, build_scene(scene, options, chosen, seed), optics, margin=margin)
 
 
 @lru_cache(maxsize=8)
