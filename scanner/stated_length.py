@@ -42,10 +42,15 @@ def stated_length_of(scale: Any) -> StatedLength | None:
 
 
 def dominates(found: Mapping[str, Any] | None) -> str | None:
-    """A hint where a document's `stated_length` {reference_mm, sigma_mm, share} is most of the variance."""
+    """A hint where a document's `stated_length` {reference_mm, sigma_mm, share, of} is most of a variance.
+
+    `of`: whose it is, in words; without, that of the depth of a scan's median point.
+    """
     if found is None or not found["share"] > DOMINANT:
         return None
     length = with_uncertainty(found["reference_mm"], 2 * found["sigma_mm"])
+    of = found.get("of", "the median point's depth")
     return (
-        f"the stated length {length} mm (k = 2) dominates, with {found['share']:.0%} of the variance: measure it better"
+        f"the stated length {length} mm (k = 2) dominates, with {found['share']:.0%} of the variance of {of}: "
+        "measure it better"
     )

@@ -169,7 +169,7 @@ class GuidedCalibration:
     def _quality(self) -> str:
         guide, view = self._guide, self.observations[-1].view
         assert guide is not None  # noqa: S101  a pose was kept
-        words = [f"{len(view.ids)} points"]
+        words = [f"{len(view.ids)} points", *self.observations[-1].warnings]
         if len(self.observations) >= FEWEST_VIEWS:
             words.append(self._residual())
         return "; ".join([*words, self._guide.gain() if self._guide else ""])

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.calibration.problem import NAMES
-from scanner.calibration.solve import Solution
+from scanner.calibration.sheet import is_exact
+from scanner.calibration.solve import Solution, sigmas
 from scanner.calibration_id import content_id
 from scanner.geometry import calibration_from_dict
 
@@ -37,11 +38,13 @@ def calibration_dict(solution: Solution, created: str | None = None) -> dict[str
         "covariance": _covariance(solution),
         "scale": _scale(solution),
         "residuals": residuals_of(solution),
+        "warnings": list(solution.warnings),
         "target": {
             "spec": solution.target.spec,
             "scale_x": float(solution.state.sheet[0]),
             "scale_y": float(solution.state.sheet[1]),
             "bow_mm": float(solution.state.sheet[2]),
+            "sigma": _sheet_sigma(solution),
         },
         "warm_up": {
             "minutes": solution.options.warm_up_minutes,
@@ -82,6 +85,14 @@ def _covariance(solution: Solution) -> dict[str, Any] | None:
         "sigma": np.sqrt(np.clip(np.diag(part), 0, None)).tolist(),
         "matrix": part.tolist(),
     }
+
+
+def _sheet_sigma(solution: Solution) -> dict[str, float] | None:
+    """Of the sheet's scales and bow, 1 sigma; None where none were fitted, or no covariance is known."""
+    sigma = sigmas(solution.adjusted)["sheet"]
+    if is_exact(solution.problem.priors) or not np.isfinite(sigma).all():
+        return None
+    return dict(zip(("scale_x", "scale_y", "bow_mm"), sigma.tolist(), strict=True))
 
 
 def _scale(solution: Solution) -> Any:

@@ -56,8 +56,9 @@ class Drift:
         if abs(self.median_px) <= self.allowed_px:
             return None
         return (
-            f"rows and columns disagree by {abs(self.median_px):.2f} px across the epipolar lines: the rig has moved "
-            f"since it was calibrated (as much along them would be {self.depth_mm:.2f} mm of depth); calibrate again"
+            f"rows and columns disagree by {abs(self.median_px):.2f} px across the epipolar lines (as much along them "
+            f"would be {self.depth_mm:.2f} mm of depth): the rig has moved since it was calibrated, or something did "
+            "during this scan, or the calibration is another rig's; scan again, and if it stays, calibrate again"
         )
 
     def as_dict(self) -> dict[str, Any]:

@@ -29,6 +29,8 @@ from scanner.sequencer import check_capture
 HEADER_FILE = "capture.json"
 DEEPEST = 3
 """Folders below one that is named in which captures are looked for."""
+MOST_NAMED = 4
+"""Captures or frames with one fault that are named; the others are counted."""
 FLATTEST = 0.02
 """Width over length of a view's points on the target, below which they lie on a line."""
 
@@ -36,7 +38,8 @@ FLATTEST = 0.02
 @dataclass(frozen=True, eq=False)
 class Observation:
     """One usable capture. response: what its patterns were corrected for; created: when it was taken; warm_up: how warm
-    the rig was, as capture.json has it; key: what its copies have too."""
+    the rig was, as capture.json has it; key: what its copies have too; warnings: what is wrong with it, though it
+    serves."""
 
     view: View
     camera_size: tuple[int, int]
@@ -45,6 +48,7 @@ class Observation:
     created: str = ""
     warm_up: Mapping[str, Any] = field(default_factory=dict)
     key: Hashable = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -148,7 +152,31 @@ def observe_capture(path: Path, name: str, target: Target) -> Observation | Left
         capture.header.created,
         capture.header.extra.get("warm_up") or {},
         key,
+        (*_lost(capture), *decoded.warnings),
     )
+
+
+def warnings_of(observations: Sequence[Observation]) -> list[str]:
+    """What is wrong with captures that serve, each thing once, after the names of those that have it."""
+    named: dict[str, list[str]] = {}
+    for one in observations:
+        for said in one.warnings:
+            named.setdefault(said, []).append(one.view.name)
+    return [f"{_and_more('capture', names)} (used): {said}" for said, names in named.items()]
+
+
+def _and_more(what: str, names: Sequence[str]) -> str:
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return f"{what}{'s' if len(names) > 1 else ''} {', '.join(names[:MOST_NAMED])}{more}"
+
+
+def _lost(capture: Capture) -> list[str]:
+    """Words for the frames of a capture that are not here."""
+    lost = capture.missing
+    if not lost:
+        return []
+    named = _and_more("frame", [str(k) for k in lost])
+    return [f"{named} of {capture.header.frame_count} lost: {capture.fault(lost[0])}"]
 
 
 def observe_decoded(

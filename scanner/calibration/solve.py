@@ -18,7 +18,7 @@ from scanner.calibration.agreement import agreed
 from scanner.calibration.drift import epipolar_offsets
 from scanner.calibration.held_out import HeldOut, hold_out
 from scanner.calibration.lens_slopes import rotation_of
-from scanner.calibration.observe import LeftOut, Observation, warm_up_of
+from scanner.calibration.observe import LeftOut, Observation, warm_up_of, warnings_of
 from scanner.calibration.plausibility import (
     Facing,
     check_facing,
@@ -33,12 +33,12 @@ from scanner.calibration.problem import (
     SHEET,
     SHIFT,
     TURN,
-    Length,
     Priors,
     Problem,
     State,
     View,
 )
+from scanner.calibration.sheet import contradiction, stated_length
 from scanner.calibration.start import FEWEST_VIEWS
 from scanner.calibration.targets import Target
 from scanner.errors import CalibrationError
@@ -135,8 +135,8 @@ def solve(
         camera_size,
         projector_size,
         tuple(views),
-        _priors(options, target),
-        stated_length(options, target),
+        priors_of(options, target),
+        stated_length(options.length, target),
     )
     found = agreed(problem)
     problem, adjusted = found.problem, found.adjusted
@@ -147,7 +147,8 @@ def solve(
     held_out = hold_out(problem, adjusted) if leave_out else HeldOut(np.full(len(problem.views), np.nan))
     adjusted = replace(adjusted, covariance=held_out.inflation * adjusted.covariance)
     used = {view.name for view in problem.views}
-    taken = sorted(o.created for o in observations if o.created and o.view.name in used)
+    served = [o for o in observations if o.view.name in used]
+    taken = sorted(o.created for o in served if o.created)
     solution = Solution(
         target,
         options,
@@ -160,9 +161,9 @@ def solve(
         (),
         observations[0].response,
         (taken[0], taken[-1]) if taken else ("", ""),
-        warm_up_of([o for o in observations if o.view.name in used]),
+        warm_up_of(served),
     )
-    return replace(solution, warnings=tuple(warnings + _warnings(solution)))
+    return replace(solution, warnings=tuple(warnings + _warnings(solution) + warnings_of(served)))
 
 
 def epipolar_errors(problem: Problem, state: State) -> tuple[Array, ...]:
@@ -228,29 +229,11 @@ def _without(views: Sequence[View], bad: Mapping[int, str], out: list[LeftOut]) 
     return [view for k, view in enumerate(views) if k not in bad]
 
 
-def _priors(options: SolveOptions, target: Target) -> Priors:
+def priors_of(options: SolveOptions, target: Target) -> Priors:
+    """How far a target may be from its nominal points: prints a thousandth, others not at all."""
     if not options.rigid and target.flat:
         return Priors()
     return Priors(sheet_scale=1e-7, sheet_bow=1e-7)
-
-
-def stated_length(options: SolveOptions, target: Target) -> Length | None:
-    """The length that was stated, checked against the target.
-
-    Raises:
-        CalibrationError: it is more than 5 % off.
-    """
-    if options.length is None:
-        return None
-    mm, sigma = options.length
-    nominal = target.longest_mm
-    if abs(mm / nominal - 1) > 0.05:
-        raise CalibrationError(
-            f"the stated length of {mm:g} mm does not fit the target: from the first to the last of its longest row "
-            f"are {nominal:g} mm",
-            hint="measure between the outermost points of the longest row, or correct the target's spacing",
-        )
-    return Length(*target.longest, mm, max(sigma, 1e-6))
 
 
 def _warnings(solution: Solution) -> list[str]:
@@ -274,6 +257,8 @@ def _warnings(solution: Solution) -> list[str]:
     total = sum(len(k) for k in adjusted.kept)
     if dropped > 0.1 * total:
         warnings.append(f"{dropped} of {total} points were left out as outliers")
+    if (contradicts := contradiction(problem, adjusted.state)) is not None:
+        warnings.append(contradicts.words)
     stretch = adjusted.state.sheet[:2] - 1
     if solution.options.length is None and np.abs(stretch).max() > 2 * problem.priors.sheet_scale:
         warnings.append(

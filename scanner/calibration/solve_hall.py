@@ -18,10 +18,11 @@ from scanner.calibration.adjustment import Adjusted
 from scanner.calibration.discs import eccentricity
 from scanner.calibration.hall import decompose, focal_spread, hall_matrix, project_hall
 from scanner.calibration.lens_slopes import rotation_of, vector_of
-from scanner.calibration.observe import LeftOut, Observation, warm_up_of
+from scanner.calibration.observe import LeftOut, Observation, warm_up_of, warnings_of
 from scanner.calibration.plausibility import MOST_RELATIVE_SIGMA, Facing, check_facing
-from scanner.calibration.problem import POSES, Priors, Problem, State, View
-from scanner.calibration.solve import Progress, Solution, SolveOptions, epipolar_errors, solve, stated_length
+from scanner.calibration.problem import POSES, Problem, State, View
+from scanner.calibration.sheet import contradiction, stated_length
+from scanner.calibration.solve import Progress, Solution, SolveOptions, epipolar_errors, priors_of, solve
 from scanner.calibration.targets import FEWEST_DISCS, Target
 from scanner.errors import CalibrationError
 from scanner.geometry import Lens
@@ -75,25 +76,30 @@ def solve_hall(
     facing, _ = check_facing([chosen.view])
     fit = _fitted(target, chosen.view)
     state, world = _parts(fit, chosen)
-    length = stated_length(options or SolveOptions(), target)
-    problem = Problem(target, chosen.camera_size, chosen.projector_size, (fit.view,), Priors(), length)
+    options = options or SolveOptions()
+    length = stated_length(options.length, target)
+    sizes = chosen.camera_size, chosen.projector_size
+    problem = Problem(target, *sizes, (fit.view,), priors_of(options, target), length)
     points = target.points[fit.view.ids]
     adjusted = _as_adjusted(state, problem, (fit.camera, fit.projector), [points])
     _check(adjusted, problem)
     _check_depth(fit, points, float(state.poses[0, 5]))
+    warnings = _warnings(facing, adjusted)
+    if (contradicts := contradiction(problem, state)) is not None:
+        warnings.append(contradicts.words)
     others = [LeftOut(one.view.name, "one capture is enough") for one in observations if one is not chosen]
     created = (chosen.created, chosen.created)
     hall = {"camera": fit.camera.tolist(), "projector": fit.projector.tolist()}
     return Solution(
         target,
-        options or SolveOptions(),
+        options,
         problem,
         adjusted,
         facing,
         np.array([np.nan]),
         epipolar_errors(problem, state),
         (*left_out, *others),
-        tuple(_warnings(facing, adjusted)),
+        (*warnings, *warnings_of([chosen])),
         chosen.response,
         created,
         warm_up_of([chosen]),

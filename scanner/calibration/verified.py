@@ -153,17 +153,29 @@ def _of_noise(on: FeaturePoints, scan: Scan, feature: Feature) -> dict[str, Any]
     return {NOISE_OF[name]: None if alone is None else alone[name] for name in feature.widths}
 
 
-def _of_stated(found: dict[str, Any], rig: Rig) -> dict[str, float] | None:
-    """The calibration's stated length, and the largest share that it has of a figure's variance."""
+IN_WORDS = {
+    "distance_mm": "the board's distance from the camera",
+    "diameter_mm": "the sphere's diameter",
+    "measured_mm": "the length between the target's ends",
+}
+"""Figures that are in proportion to the calibration's scale"""
+
+
+def _of_stated(found: dict[str, Any], rig: Rig) -> dict[str, Any] | None:
+    """The calibration's stated length, the largest share that it has of a figure's variance, and of which."""
     stated = stated_length_of(rig.calibration.extra.get("scale"))
     if stated is None:
         return None
     shares = [
-        stated.share(found[kind][name], found[kind]["uncertainty"][name]["expanded"] / COVERAGE_FACTOR)
+        (stated.share(found[kind][name], found[kind]["uncertainty"][name]["expanded"] / COVERAGE_FACTOR), kind, name)
         for kind, name in (("flat", "distance_mm"), ("sphere", "diameter_mm"), ("length", "measured_mm"))
         if kind in found and found[kind]["uncertainty"][name]["expanded"] is not None
     ]
-    return {"reference_mm": stated.reference_mm, "sigma_mm": stated.sigma_mm, "share": max(shares, default=0.0)}
+    if not shares:
+        return None
+    share, kind, name = max(shares)
+    of = f"{IN_WORDS[name]}, {found[kind][name]:.1f} mm"
+    return {"reference_mm": stated.reference_mm, "sigma_mm": stated.sigma_mm, "share": share, "of": of}
 
 
 def _spreads(found: dict[str, Any]) -> dict[str, Any]:

@@ -175,17 +175,22 @@ def _warnings(solution: Solution, content: dict[str, Any]) -> list[str]:
     return [*solution.warnings, unverified]
 
 
-def _length_in_translation(solution: Solution, content: dict[str, Any]) -> dict[str, float] | None:
+def _length_in_translation(solution: Solution, content: dict[str, Any]) -> dict[str, Any] | None:
     """The stated length and its share of the baseline's variance; None where there is none, or no covariance."""
     length, shift = stated_length_of(content["scale"]), solution.state.translation
     if length is None or content["covariance"] is None:
         return None
     from scanner.calibration.problem import SHIFT  # noqa: PLC0415
+    from scanner.calibration.sheet import adjusted_length  # noqa: PLC0415
 
     baseline = math.hypot(*shift)
     variance = float(shift @ solution.adjusted.covariance[SHIFT, SHIFT] @ shift) / baseline**2
-    share = length.share(baseline, math.sqrt(max(variance, 0.0)))
-    return {"reference_mm": length.reference_mm, "sigma_mm": length.sigma_mm, "share": share}
+    # Where prints are known better than the length is, the print decides, and the length has a small weight.
+    adjusted = adjusted_length(solution.problem, solution.state, solution.adjusted.covariance)
+    weight = 1.0 if adjusted is None else min((adjusted[1] / length.sigma_mm) ** 2, 1.0)
+    share = weight**2 * length.share(baseline, math.sqrt(max(variance, 0.0)))
+    of = f"the distance from lens to lens, {baseline:.1f} mm"
+    return {"reference_mm": length.reference_mm, "sigma_mm": length.sigma_mm, "share": share, "of": of}
 
 
 def _document(solution: Solution, content: dict[str, Any], output: Path, drawing: Path | None) -> dict[str, Any]:
@@ -228,6 +233,7 @@ def _facts(
     relative = "; relative to the target's stated size: scale unverified" if scale == "unverified" else ""
     told = ", ".join(_stated(v, e) for v, e in zip(shift, s, strict=True))
     facts.append(("translation", f"{told} mm{relative}"))
+    facts.append(("sheet", _sheet(solution)))
     if content["covariance"] is not None:
         facts.append(("+-", "expanded uncertainty, k = 2, of each of these figures"))
     residuals = content["residuals"]
@@ -241,10 +247,35 @@ def _facts(
     facts.append(
         ("scale", "unverified: no length was stated (--length)")
         if scale == "unverified"
-        else ("scale", f"rests on {with_uncertainty(scale['reference_mm'], 2 * scale['sigma_mm'])} mm (k = 2)")
+        else ("scale", _scale(solution))
     )
     facts.append(("file", output))
     return facts if drawing is None else [*facts, ("picture", drawing)]
+
+
+def _sheet(solution: Solution) -> str:
+    """What was found of the target's sheet, against its nominal size."""
+    from scanner.calibration.sheet import is_exact  # noqa: PLC0415
+    from scanner.calibration.solve import sigmas  # noqa: PLC0415
+
+    if is_exact(solution.problem.priors):
+        return "taken as exact: no stretch and no bow are fitted"
+    x, y, bow = (_stated(v, e) for v, e in zip(solution.state.sheet, sigmas(solution.adjusted)["sheet"], strict=True))
+    return f"scale x {x}, scale y {y} of its nominal size, bow {bow} mm"
+
+
+def _scale(solution: Solution) -> str:
+    """The length that was stated, and what it is on the adjusted sheet."""
+    from scanner.calibration.sheet import adjusted_length, is_exact  # noqa: PLC0415
+
+    length = solution.problem.length
+    found = adjusted_length(solution.problem, solution.state, solution.adjusted.covariance)
+    if length is None or found is None:
+        return ""
+    stated = with_uncertainty(length.mm, 2 * length.sigma_mm)
+    if is_exact(solution.problem.priors):
+        return f"the target's own, {found[0]:g} mm, taken as exact; stated: {stated} mm (k = 2)"
+    return f"rests on {stated} mm (k = 2), adjusted to {_stated(*found)} mm with what prints are off"
 
 
 def _stated(value: float, sigma: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +16,9 @@ from scanner.calibration.lens_slopes import lens_numbers
 from scanner.calibration.observe import LeftOut, Observation
 from scanner.calibration.panel import SIZE, ticks
 from scanner.calibration.pictures import HEAD_PX, draw
-from scanner.calibration.problem import POSES, Problem, State, View
-from scanner.calibration.solve import Solution, SolveOptions, sigmas, solve, thinned
+from scanner.calibration.problem import POSES, Length, Problem, State, View
+from scanner.calibration.sheet import contradiction, stated_length
+from scanner.calibration.solve import Solution, SolveOptions, priors_of, sigmas, solve, thinned
 from scanner.calibration.targets import parse_target
 from scanner.digits import with_uncertainty
 from scanner.errors import CalibrationError
@@ -117,7 +119,7 @@ def test_large_problems_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_stretched_sheet_is_found() -> None:
-    stretched = observations(RIG, poses(), sheet=(1.0, 1.002, 1.0))
+    stretched = observations(RIG, poses(6), sheet=(1.0, 1.002, 1.0))
     found = calibrate(TARGET, stretched, LENGTH)
     assert found.state.sheet[1] == pytest.approx(1.002, abs=2e-4)
     assert found.state.translation == pytest.approx(RIG.translation, abs=0.3)
@@ -128,9 +130,12 @@ def test_scale_is_the_stated_length_or_unverified(solution: Solution, capsys: py
     assert plain["scale"] == "unverified"
     stated = calibration_dict(solution)
     assert stated["scale"] == {"reference_mm": 240.0, "sigma_mm": 0.01}
+    assert stated["warnings"] == plain["warnings"] == []
+    assert (plain["target"]["sigma"], stated["target"]["sigma"]["scale_x"]) == (None, pytest.approx(4e-5, rel=0.3))
     report(solution, stated, Path("rig.json"), None, as_json=False)
     shown = capsys.readouterr().out
-    assert "rests on 240.000 +- 0.020 mm (k = 2)" in shown
+    assert "rests on 240.000 +- 0.020 mm (k = 2), adjusted to 240.0" in shown
+    assert re.search(r"sheet +scale x \d\.\d+ \+- 0\.\d+, scale y \d\.\d+ \+- 0\.\d+ of its nominal size, bow", shown)
     twice = 2 * sigmas(solution.adjusted)["camera"][0]
     assert f"focal {with_uncertainty(solution.state.camera.matrix[0, 0], twice)}, " in shown
     assert "unverified" not in shown
@@ -139,6 +144,44 @@ def test_scale_is_the_stated_length_or_unverified(solution: Solution, capsys: py
     # A scale that nobody verified is a thousandth unsure, and the translation says so.
     unverified = calibrate(TARGET, observations(RIG, poses(6)))
     assert sigmas(unverified.adjusted)["translation"][0] > 5 * sigmas(solution.adjusted)["translation"][0]
+
+
+def test_a_length_that_contradicts_the_print_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """238 mm on what is 240 mm by its name: 2 mm of which a print (0.24 mm) and the length (0.1 mm) explain 0.26."""
+    found = calibrate(TARGET, observations(RIG, poses(6)), SolveOptions(length=(238.0, 0.1)))
+    content = calibration_dict(found)
+    assert content["warnings"] == list(found.warnings)
+    report(found, content, tmp_path / "rig.json", None, as_json=False)
+    shown = " ".join(capsys.readouterr().err.split())
+    for words in (
+        "238.00 +- 0.20 mm, contradicts the target's 240 mm (+- 0.48 mm as prints go; +- is k = 2)",
+        "it is 2.00 mm (0.83%) shorter, 7.7 sigmas of both together; the calibration has 238.",
+        "state its spacing as it is: 29.75 mm instead of 30",
+        "of the variance of the distance from lens to lens, 2",
+    ):
+        assert words in shown
+
+
+@pytest.mark.parametrize(
+    ("mm", "sigma", "rigid", "sigmas"),
+    [(240.7, 0.1, False, None), (239.1, 0.1, False, 3.5), (239.1, 0.5, False, None), (240.2, 0.05, True, 4.0)],
+)
+def test_length_and_print_contradict_each_other_from_three_sigmas(
+    solution: Solution, mm: float, sigma: float, rigid: bool, sigmas: float | None
+) -> None:
+    priors = priors_of(SolveOptions(rigid=rigid), TARGET)
+    problem = replace(solution.problem, priors=priors, length=Length(*TARGET.longest, mm, sigma))
+    found = contradiction(problem, solution.state)
+    assert (None if found is None else found.sigmas) == (None if sigmas is None else pytest.approx(sigmas, abs=0.05))
+    if found is not None:
+        assert ("leave --rigid out" in found.words, "taken as exact" in found.words) == (rigid, rigid)
+    assert contradiction(replace(problem, length=None), solution.state) is None
+
+
+def test_a_length_that_no_printer_makes_is_refused() -> None:
+    with pytest.raises(CalibrationError, match=r"of 210 mm does not fit the target: .* 240 mm, -12%") as refused:
+        stated_length((210.0, 0.1), TARGET)
+    assert "26.25 mm instead of 30 would fit" in str(refused.value.hint)
 
 
 def test_file_is_read_back_and_its_id_is_its_content(solution: Solution) -> None:

@@ -37,7 +37,12 @@ def test_a_stated_length_is_named_where_it_is_most_of_a_variance() -> None:
     found = {"reference_mm": 240.0, "sigma_mm": 0.05, "share": length.share(1346, 0.3)}
     said = dominates(found)
     assert said is not None
-    assert said.startswith("the stated length 240.00 +- 0.10 mm (k = 2) dominates, with 87% of the variance")
+    assert said.startswith(
+        "the stated length 240.00 +- 0.10 mm (k = 2) dominates, with 87% of the variance of the median"
+    )
+    named = dominates({**found, "of": "the sphere's diameter"})
+    assert named is not None
+    assert named.endswith("of the variance of the sphere's diameter: measure it better")
     assert dominates({**found, "share": length.share(1346, 0.4)}) is None
     assert dominates(None) is None
     assert stated_length_of("unverified") is None
