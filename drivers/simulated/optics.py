@@ -56,18 +56,22 @@ class Optics:
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """Light along one axis of the projected picture, the other axis constant: (size * steps + 2,) float32."""
+    """Light along one axis of the picture, the other axis constant: ((size + 2 border) * steps + 2,) float32."""
 
     axis: Literal["row", "column"]
     steps: int
+    border: int
+    """px before the picture's beginning at which the table begins"""
     light: Plane
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Light over the projected picture: (height * steps + 2, width * steps + 2) float32."""
+    """Light over the picture: ((height + 2 border) * steps + 2, (width + 2 border) * steps + 2) float32."""
 
     steps: int
+    border: int
+    """px before the picture's beginning at which the table begins, along both axes"""
     light: Plane
 
 
@@ -86,6 +90,11 @@ def flat_axis(image: Image) -> Literal["row", "column"] | None:
     return None
 
 
+def spill_px(sigma_px: float) -> int:
+    """How far beyond the picture's ends its light reaches, px: the pixel square and 4.5 sigmas of blur."""
+    return int(np.ceil(1.0 + 4.5 * sigma_px))
+
+
 def line_of_light(values: Image, response: Plane, sigma_px: float, axis: Literal["row", "column"]) -> Line:
     """Light of an image that changes along `axis` only.
 
@@ -95,48 +104,43 @@ def line_of_light(values: Image, response: Plane, sigma_px: float, axis: Literal
         sigma_px: projector blur.
         axis: see `flat_axis`.
     """
-    steps = STEPS_PER_PX_LINE
-    reach = _reach(sigma_px)
-    padded = np.pad(response[values].astype(np.float64), reach)
-    fine = np.zeros(len(values) * steps + 2, dtype=np.float32)
+    steps, reach = STEPS_PER_PX_LINE, spill_px(sigma_px)
+    padded = np.pad(response[values].astype(np.float64), 2 * reach)
+    end = (len(values) + 2 * reach) * steps
+    fine = np.zeros(end + 2, dtype=np.float32)
     for phase in range(steps):
         weights = _pixel_weights(phase / steps - 0.5, reach, sigma_px)
-        fine[phase : len(values) * steps : steps] = np.convolve(padded, weights[::-1], mode="valid")
-    fine[-2:] = fine[-3]
-    return Line(axis, steps, fine)
+        fine[phase:end:steps] = np.convolve(padded, weights[::-1], mode="valid")
+    return Line(axis, steps, reach, fine)
 
 
 def grid_of_light(image: Image, response: Plane, sigma_px: float) -> Grid:
     """Light of any image: (height, width) uint8."""
     steps = STEPS_PER_PX_GRID if sigma_px >= 0.5 else 2 * STEPS_PER_PX_GRID
-    height, width = image.shape
-    reach = _reach(sigma_px)
-    padded = cv2.copyMakeBorder(response[image], reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0.0)
-    fine = np.empty((height * steps + 2, width * steps + 2), dtype=np.float32)
+    reach = spill_px(sigma_px)
+    around = 2 * reach
+    padded = cv2.copyMakeBorder(response[image], around, around, around, around, cv2.BORDER_CONSTANT, value=0.0)
+    height, width = ((n + around) * steps for n in image.shape)
+    fine = np.zeros((height + 2, width + 2), dtype=np.float32)
     weights = [_pixel_weights(phase / steps - 0.5, reach, sigma_px) for phase in range(steps)]
     for r, down in enumerate(weights):
         for c, across in enumerate(weights):
             part = cv2.sepFilter2D(padded, cv2.CV_32F, across, down)
-            fine[r : height * steps : steps, c : width * steps : steps] = part[reach:-reach, reach:-reach]
-    fine[-2:] = fine[-3]
-    fine[:, -2:] = fine[:, -3:-2]
-    return Grid(steps, fine)
+            fine[r:height:steps, c:width:steps] = part[reach:-reach, reach:-reach]
+    return Grid(steps, reach, fine)
 
 
 def look_up(light: Light, row: Plane, column: Plane, gain: Plane, floor: Plane, out: Plane) -> None:
     """out = light at each camera pixel * gain + floor, all (H, W) float32; out may be floor.
 
-    row, column: projector coordinates + 0.5, so that the picture begins at 0; within the picture.
+    row, column: projector coordinates + 0.5, so that the picture begins at 0; within the table.
     """
+    steps, begin = np.float32(light.steps), np.float32(light.steps * light.border)
     if isinstance(light, Grid):
-        _look_up_grid(row, column, light.light, np.float32(light.steps), gain, floor, out)
+        _look_up_grid(row, column, light.light, steps, begin, gain, floor, out)
     else:
         coordinate = row if light.axis == "row" else column
-        _look_up_line(coordinate, light.light, np.float32(light.steps), gain, floor, out)
-
-
-def _reach(sigma_px: float) -> int:
-    return int(np.ceil(1.0 + 4.5 * sigma_px))
+        _look_up_line(coordinate, light.light, steps, begin, gain, floor, out)
 
 
 def _pixel_weights(offset: float, reach: int, sigma_px: float) -> Array:
@@ -153,20 +157,20 @@ def _pixel_weights(offset: float, reach: int, sigma_px: float) -> Array:
 
 
 @kernel
-def _look_up_line(coordinate, table, steps, gain, floor, out):
+def _look_up_line(coordinate, table, steps, begin, gain, floor, out):
     for r in range(out.shape[0]):
         for c in range(out.shape[1]):
-            t = coordinate[r, c] * steps
+            t = coordinate[r, c] * steps + begin
             i = np.uint32(t)
             low = table[i]
             out[r, c] = (low + (t - np.float32(i)) * (table[i + np.uint32(1)] - low)) * gain[r, c] + floor[r, c]
 
 
 @kernel
-def _look_up_grid(row, column, table, steps, gain, floor, out):
+def _look_up_grid(row, column, table, steps, begin, gain, floor, out):
     for r in range(out.shape[0]):
         for c in range(out.shape[1]):
-            v, u = row[r, c] * steps, column[r, c] * steps
+            v, u = row[r, c] * steps + begin, column[r, c] * steps + begin
             i, j = np.uint32(v), np.uint32(u)
             a, b = u - np.float32(j), v - np.float32(i)
             upper = table[i, j] + a * (table[i, j + np.uint32(1)] - table[i, j])
@@ -179,5 +183,5 @@ def warm_up() -> None:
     """Compile the kernels (or load them from their cache)."""
     flat = np.zeros((2, 2), dtype=np.float32)
     table = np.zeros((8, 8), dtype=np.float32)
-    _look_up_line(flat, table[0], np.float32(2), flat, flat, flat.copy())
-    _look_up_grid(flat, flat, table, np.float32(2), flat, flat, flat.copy())
+    _look_up_line(flat, table[0], np.float32(2), np.float32(0), flat, flat, flat.copy())
+    _look_up_grid(flat, flat, table, np.float32(2), np.float32(0), flat, flat, flat.copy())

@@ -34,8 +34,9 @@ class View:
     """A scene as the camera sees it, all (H + 2 margin, W + 2 margin); the truth is of its pixels alone, (H, W).
 
     Beyond its pixels lies what the lens blurs onto them: `margin` px of it on each side.
-    row, column: float32 projector coordinates + 0.5 (so the picture begins at 0), 0 where not lit. shade: reflected
-    light for full-on light, in shares of what a white facing plane at the aim point would reflect; 0 where not lit.
+    row, column: float32 projector coordinates + 0.5 (so the picture begins at 0), 0 where no light comes. shade:
+    reflected light for full-on light, in shares of what a white facing plane at the aim point would reflect; 0 where no
+    light comes: light comes where the truth is lit, and as far beside the picture's ends as its blur carries (`spill`).
     floor: reflected ambient light in the same unit.
     """
 
@@ -47,8 +48,11 @@ class View:
     margin: int
 
 
-def view_scene(rig: Rig, scene: Scene, optics: Optics, stride: int = 1, margin: int = 0) -> View:
-    """Cast and shade a scene; stride > 1 looks at every stride-th pixel only. margin: see `View`."""
+def view_scene(rig: Rig, scene: Scene, optics: Optics, stride: int = 1, margin: int = 0, spill: int = 0) -> View:
+    """Cast and shade a scene; stride > 1 looks at every stride-th pixel only.
+
+    margin, spill: camera px and projector px beyond the two pictures; see `View`.
+    """
     grid = _pixels(rig.calibration.camera, stride, margin)
     shape = grid.shape[:2]
     directions = _directions(rig.calibration.camera, grid)
@@ -57,7 +61,7 @@ def view_scene(rig: Rig, scene: Scene, optics: Optics, stride: int = 1, margin: 
     light = rig.to_scene(rig.calibration.projector_centre)
     lit = lit_points(origin, directions, hits, light, scene.bodies, scene.field)
     albedo = _albedo(scene, hits, directions, origin, shape)
-    return _shaded(rig, scene, optics, directions, hits, lit, albedo, shape, margin)
+    return _shaded(rig, scene, optics, directions, hits, lit, albedo, shape, margin, spill)
 
 
 def white_level(rig: Rig, optics: Optics) -> float:
@@ -107,6 +111,7 @@ def _shaded(
     albedo: Plane,
     shape: tuple[int, ...],
     margin: int,
+    spill: int,
 ) -> View:
     calibration = rig.calibration
     projector = calibration.projector
@@ -127,6 +132,7 @@ def _shaded(
         place,
         lens,
         exponents,
+        float(spill),
         lit,
         planes,
         xyz,
@@ -143,7 +149,7 @@ def _shaded(
 
 
 @kernel
-def _shade(directions, distance, body, normal, albedo, gloss, place, lens, exponents, lit, planes, xyz):
+def _shade(directions, distance, body, normal, albedo, gloss, place, lens, exponents, spill, lit, planes, xyz):
     """Fill row, column, shade, floor, true rows, true columns (planes) and xyz; narrow `lit` to the picture."""
     half_power = 0.5 * exponents[1]
     aim2 = place[15] ** 2 + place[16] ** 2 + place[17] ** 2
@@ -166,9 +172,10 @@ def _shade(directions, distance, body, normal, albedo, gloss, place, lens, expon
         vignette = (1.0 + dx * dx + dy * dy) ** -half_power
         planes[3, i] = albedo[i] * exponents[2] * vignette
         # Strictly inside, so that a lookup in single precision stays inside, too.
-        inside = pz > 0 and -0.5 < column < lens[14] - 0.501 and -0.5 < row < lens[15] - 0.501
-        lit[i] = lit[i] and inside
-        if not lit[i]:
+        beside = max(-0.5 - column, column - lens[14] + 0.501, -0.5 - row, row - lens[15] + 0.501)
+        faces = lit[i] and pz > 0
+        lit[i] = faces and beside < 0
+        if not faces or beside >= spill:
             continue
         lx, ly, lz = place[12] - x, place[13] - y, place[14] - z
         far2 = lx * lx + ly * ly + lz * lz
@@ -214,6 +221,7 @@ def warm_up() -> None:
         np.ones(18),
         np.ones(16),
         np.ones(3),
+        0.0,
         np.ones(1, dtype=np.bool_),
         planes,
         xyz,

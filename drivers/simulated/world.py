@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.simulated import timeline
 from drivers.simulated.lines import Line, LineName
-from drivers.simulated.optics import Light, Optics, Plane, look_up
+from drivers.simulated.optics import Light, Optics, Plane, look_up, spill_px
 from drivers.simulated.options import Settings, WorldSettings, check_same_world
 from drivers.simulated.rigs import Rig, rig
 from drivers.simulated.scenes import SceneOptions, build_scene
@@ -114,8 +114,8 @@ class World:
         options = s.scene_options
         if self._steps:
             options = replace(options, pose=(options.pose + self._steps) % POSES)
-        margin = len(self._taps) - 1
-        return _view(s.rig, s.scene, options, seed, o.projector_falloff, o.vignetting, o.ambient, margin)
+        beyond = len(self._taps) - 1, spill_px(self._sigma)
+        return _view(s.rig, s.scene, options, seed, o.projector_falloff, o.vignetting, o.ambient, *beyond)
 
     @property
     def _pose(self) -> tuple[int, ...]:
@@ -268,11 +268,12 @@ def _view(
     vignetting: float,
     ambient: float,
     margin: int,
+    spill: int,
 ) -> View:
     """A view, kept for the worlds that follow: a rig's daemon opens the same scene again and again."""
     optics = Optics(projector_falloff=falloff, vignetting=vignetting, ambient=ambient)
     chosen = rig(rig_name)
-    return view_scene(chosen, build_scene(scene, options, chosen, seed), optics, margin=margin)
+    return view_scene(chosen, build_scene(scene, options, chosen, seed), optics, margin=margin, spill=spill)
 
 
 @lru_cache(maxsize=8)

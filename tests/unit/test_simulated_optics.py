@@ -26,7 +26,7 @@ def exact_light(values: np.ndarray, position: np.ndarray, sigma: float) -> np.nd
 def test_line_of_light_is_the_pixel_square_blurred(sigma: float) -> None:
     values = np.random.default_rng(1).integers(0, 256, 64, dtype=np.uint8)
     line = optics.line_of_light(values, RESPONSE, sigma, "row")
-    position = np.arange(64 * line.steps) / line.steps - 0.5
+    position = np.arange((64 + 2 * line.border) * line.steps) / line.steps - 0.5 - line.border
     expected = exact_light(values / 255.0, position, sigma)
     assert np.abs(line.light[: len(position)] - expected).max() < 2e-6
 
@@ -37,8 +37,9 @@ def test_grid_of_light_is_the_product_of_two_lines(sigma: float) -> None:
     rows, columns = generator.integers(0, 16, 24), generator.integers(0, 16, 30)
     image = (rows[:, None] * columns[None, :]).astype(np.uint8)
     grid = optics.grid_of_light(image, RESPONSE, sigma)
-    down = exact_light(rows / 1.0, np.arange(24 * grid.steps) / grid.steps - 0.5, sigma)
-    across = exact_light(columns / 255.0, np.arange(30 * grid.steps) / grid.steps - 0.5, sigma)
+    begin = -0.5 - grid.border
+    down = exact_light(rows / 1.0, np.arange((24 - 2 * begin - 1) * grid.steps) / grid.steps + begin, sigma)
+    across = exact_light(columns / 255.0, np.arange((30 - 2 * begin - 1) * grid.steps) / grid.steps + begin, sigma)
     assert np.abs(grid.light[: len(down), : len(across)] - down[:, None] * across[None, :]).max() < 2e-6
 
 
@@ -46,19 +47,20 @@ def test_lookup_is_linear_between_the_steps() -> None:
     image = np.random.default_rng(3).integers(0, 256, (20, 30), dtype=np.uint8)
     grid = optics.grid_of_light(image, RESPONSE, 0.7)
     generator = np.random.default_rng(4)
-    row = generator.uniform(0, 19.99, (7, 9)).astype(np.float32)
-    column = generator.uniform(0, 29.99, (7, 9)).astype(np.float32)
+    row = generator.uniform(-grid.border, 19.99 + grid.border, (7, 9)).astype(np.float32)
+    column = generator.uniform(-grid.border, 29.99 + grid.border, (7, 9)).astype(np.float32)
     gain, floor = generator.random((2, 7, 9), dtype=np.float32)
     out = np.empty_like(row)
     optics.look_up(grid, row, column, gain, floor, out)
-    i, j = np.floor(row * 2).astype(int), np.floor(column * 2).astype(int)
-    a, b = column * 2 - j, row * 2 - i
+    u, v = column * 2 + grid.border * 2, row * 2 + grid.border * 2
+    i, j = np.floor(v).astype(int), np.floor(u).astype(int)
+    a, b = u - j, v - i
     t = grid.light
     light = (1 - b) * ((1 - a) * t[i, j] + a * t[i, j + 1]) + b * ((1 - a) * t[i + 1, j] + a * t[i + 1, j + 1])
     assert np.abs(out - (light * gain + floor)).max() < 1e-5
     line = optics.line_of_light(image[:, 0], RESPONSE, 0.7, "row")
     optics.look_up(line, row, column, gain, floor, out)
-    light = np.interp(row, np.arange(len(line.light)) / line.steps, line.light)
+    light = np.interp(row, np.arange(len(line.light)) / line.steps - line.border, line.light)
     assert np.abs(out - (light * gain + floor)).max() < 1e-5
 
 

@@ -133,6 +133,20 @@ def test_every_scene_is_lit_and_its_truth_is_exact(name: str) -> None:
     assert np.abs(v.row[truth.lit] - truth.rows[truth.lit] - 0.5).max() < 1e-3
 
 
+def test_blur_carries_light_beyond_the_picture_and_the_truth_says_where_it_ends() -> None:
+    """The board of bench2026, where the end of the projected picture is in view."""
+    r = rig("bench2026")
+    v = view.view_scene(r, build_scene("board", SceneOptions(), r, 0), Optics(), stride=4, spill=5)
+    middle = (v.truth.columns - 959.5, v.truth.rows - 539.5)
+    beyond = np.maximum(np.abs(middle[0]) - 960, np.abs(middle[1]) - 540)
+    near, far = (beyond > 0.01) & (beyond < 4.99), beyond > 5.01
+    assert near.sum() > 100
+    assert (v.shade[near] > 0).all()
+    assert not v.truth.lit[near | far].any()
+    assert not v.shade[far].any()
+    assert np.abs(v.column[near] - v.truth.columns[near] - 0.5).max() < 1e-3
+
+
 def test_scene_surfaces_are_those_of_scenes_json() -> None:
     r = rig("quick")
 
