@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from drivers.simulated.camera import SimulatedCamera
+from drivers.simulated.nominals import nominals
 from drivers.simulated.options import DEFAULT_SCENE, Settings, read_settings, setting_problems
 from drivers.simulated.projector import SimulatedProjector
 from drivers.simulated.rigs import rig, rig_names
@@ -117,12 +118,15 @@ def _name(rig_name: str, scene: str, role: str) -> str:
 
 
 def _info(rig_name: str, kind: Literal["camera", "projector"]) -> DeviceInfo:
-    calibration = rig(rig_name).calibration
-    lens = calibration.camera if kind == "camera" else calibration.projector
+    chosen = rig(rig_name)
+    lens = chosen.calibration.camera if kind == "camera" else chosen.calibration.projector
+    details = {"width": lens.size[0], "height": lens.size[1], "scenes": list(scene_names())}
+    if kind == "camera":
+        details["nominals"] = nominals(chosen)
     return DeviceInfo(
         driver=DRIVER,
         device=f"{rig_name}/{DEFAULT_SCENE}",
         kind=kind,
         model=f"simulated rig {rig_name}",
-        details={"width": lens.size[0], "height": lens.size[1], "scenes": list(scene_names())},
+        details=details,
     )

@@ -40,9 +40,25 @@ def devices(as_json: AsJson = False) -> int:
     if len(simulated) == len(found):
         print("\nno device is plugged in that a driver can see (fringed doctor looks why); without one:")
         print("fringed scan --rig simulated")
+        _print_nominals([device for device in simulated if device.kind == "camera"])
     if simulated:
         print(f"\n{_simulated_rig(simulated)}")
     return 0
+
+
+def _print_nominals(cameras: Sequence[DeviceInfo]) -> None:
+    """What stands in the simulated scenes, by the first figure of each: what a measurement is held against."""
+    of_rigs = [camera.details.get("nominals", {}) for camera in cameras]
+    rows = []
+    for scene, figures in (of_rigs[0] if of_rigs else {}).items():
+        name = next(iter(figures))
+        if not isinstance(figures[name], list):
+            rows.append((scene, name, *(nominals[scene][name] for nominals in of_rigs)))
+    if rows:
+        print()
+        rigs = (camera.device.partition("/")[0] for camera in cameras)
+        print_table("what stands in the simulated scenes", ("scene", "nominal", *rigs), rows)
+        print("(all sizes and places: fringed devices --json)")
 
 
 def _simulated_rig(devices: Sequence[DeviceInfo]) -> str:
