@@ -297,6 +297,19 @@ all_of: Callable[[Lanes], bool] = _intrinsic(_all_of)
 """Whether the mask is set everywhere."""
 
 
+def _lowest(context: Any, values: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = ir.FunctionType(ir.FloatType(), [_FLOATS.vector])
+        name = f"llvm.vector.reduce.fmin.v{LANES}f32"
+        return builder.call(_compiler.get_or_insert_function(builder.module, kind, name), arguments)
+
+    return (types.float32(values), generate) if values is _FLOATS else None
+
+
+lowest: Callable[[Lanes], Any] = _intrinsic(_lowest)
+"""The least number of all lanes, as one float; NaN is none."""
+
+
 # --- memory -----------------------------------------------------------------------------------------------------------
 
 

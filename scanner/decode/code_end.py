@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scanner.decode import Map
 from scanner.decode.addresses import pixels_at
-from scanner.decode.field_end import boxes_near_ends
+from scanner.decode.near_ends import boxes_near_ends
 from scanner.kernel import kernel
 
 ALSO_NEAR_PX = 4.0

@@ -8,7 +8,7 @@ beyond the end the pixel is left undecided; inside, its sigma is widened by the 
 time. Coordinates are not corrected.
 
 How wide the blur is, the fringes say: it takes more of the height of fine ones than of coarse ones. Nothing here looks
-at frames. Where no coordinate is near an end, a look at a grid of pixels is all that is done.
+at frames, and at a map only where some coordinate is near an end: decoders tell how near (`far_rooms`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from scanner.decode import Map, Reason
+from scanner.decode.middles import nth_of
+from scanner.decode.pmp_kernels import ROOM_STRETCH
 from scanner.decode.pmp_sample import Sample
 from scanner.kernel import kernel
 from scanner.patterns import PmpPattern
@@ -38,13 +40,8 @@ REACH = 4.0
 """Blurs from the end beyond which the pull is less than 1e-4 of a blur"""
 
 MARGIN_SHARE, MARGIN_PX = 1 / 20, 32.0
-"""From an end, share of the field and px, whichever is more: coordinates so near are looked at one by one. It is
-several steps of the grid that looks for them, and all that the widest blur reaches (a hundredth of the field: fringes
-that are worth projecting are gone by then)."""
-
-GRID_POINTS = 1000
-"""As many pixels are asked whether any is near. Only things smaller than a thousandth of the picture are missed, where
-all of them lies near an end, and nothing around them does."""
+"""From an end, share of the field and px, whichever is more: coordinates so near are told by decoders. It is more than
+all that the widest blur reaches (a hundredth of the field: fringes that are worth projecting are gone by then)."""
 
 LEAST_BLUR_PX = 1 / math.sqrt(12)
 """A projector pixel's own width"""
@@ -68,11 +65,11 @@ WORTH_A_WORD = 0.03
 """Of the decided pixels, drawn by more than their noise or left out: a field whose ends are in view has a hundredth"""
 
 _TABLE_STEPS = 64
-_TOGETHER = 64
 _HALF_NORMAL_MEAN = math.sqrt(2 / math.pi)
 """Apparent distance, in blurs, of a place on the end itself"""
 
 _NAN = np.float32(np.nan)
+_NO_MAP = np.empty(0, np.float32)
 _VALUE, _BORDER = np.uint8(Reason.VALUE), np.uint8(Reason.BORDER)
 
 
@@ -132,18 +129,30 @@ def heights_of(pattern: PmpPattern, along: int, sample: Sample, half_contrast: M
     """
     frequencies = pattern.frequencies
     fine, coarse = (pick(range(len(frequencies)), key=lambda k: frequencies[k]) for pick in (max, min))
-    there = sample.usable & (sample.mean > 0)
-    pixels = (sample.runs[:, None] + np.arange(sample.mean.shape[1]))[there]
-    height, lowest2 = sample.modulations[fine][there], frequencies[coarse] ** 2
-    if fine != coarse:
-        flat = sample.modulations[coarse][there]
-    elif along / frequencies[fine] > LONGEST_TOLD_PX:
-        return None
-    else:
-        level = sample.mean[there] if half_contrast is None else half_contrast[pixels]
-        flat, lowest2 = level * np.float32(AMPLITUDE / MEAN), 0.0
-    ratios = height / np.maximum(flat, np.float32(1e-3))
+    lowest2, share, contrast = frequencies[coarse] ** 2, np.float32(1), _NO_MAP
+    flat = sample.modulations[coarse]
+    if fine == coarse:
+        if along / frequencies[fine] > LONGEST_TOLD_PX:
+            return None
+        lowest2, share, flat = 0.0, np.float32(AMPLITUDE / MEAN), sample.mean
+        contrast = _NO_MAP if half_contrast is None else half_contrast
+    pixels, ratios = _ratios(
+        sample.runs, sample.modulations[fine], flat, contrast, share, sample.mean, sample.usable,
+    )  # fmt: skip
     return Heights(pixels, ratios, along**2 / (2 * math.pi**2 * (frequencies[fine] ** 2 - lowest2)))
+
+
+def far_rooms(pixels: int) -> NDArray[np.float32]:
+    """(2, n) float32, to be lowered by a decoder: projector px from the field's first and last end to the nearest pixel
+    of each ROOM_STRETCH that has a coordinate, where any is nearer than `margin_px`; more where none is."""
+    return np.full((2, -(-pixels // ROOM_STRETCH)), np.inf, np.float32)
+
+
+def rooms_of(position: Map, along: int) -> NDArray[np.float32]:
+    """`far_rooms` of a whole map, for a decoder that does not tell. position, along: see `mind_ends`."""
+    rooms = far_rooms(position.size)
+    _lower(position, along, rooms)
+    return rooms
 
 
 def mind_ends(
@@ -151,7 +160,7 @@ def mind_ends(
     sigma: Map,
     confidence: Map,
     reason: NDArray[np.uint8],
-    width: int,
+    rooms: NDArray[np.float32],
     along: int,
     heights: Callable[[], Heights | None],
     counts: NDArray[np.int64],
@@ -161,46 +170,31 @@ def mind_ends(
     Args:
         position, sigma, confidence: (P,) float32, reason: (P,) uint8, of one axis, as decided; changed in place. sigma
             may be empty, and is left out then.
-        width: pixels a row. along: projector px of the field, which ends half a pixel before 0 and behind the last.
+        rooms: (2, n) float32, no more than what `far_rooms` says. along: projector px of the field, which ends half a
+            pixel before 0 and behind the last.
         heights: called where coordinates are near an end; None: nothing tells the blur.
         counts: (REASONS,) int64 pixels by reason, kept true.
 
     Returns:
-        What was done; None where no coordinate is near an end.
+        What was done; None where no coordinate is near enough to an end.
     """
-    boxes = boxes_near_ends(position, width, along)
-    if not boxes:
+    # Farther in than the widest blur's reach: of sigmas, or, where there are none, of what is left out.
+    reach = margin_px(along) * (1 if sigma.size else _HALF_NORMAL_MEAN / REACH)
+    near = [end for end in (0, 1) if rooms[end].min() < reach]
+    if not near:
         return None
-    rows, seen = (-1, width), heights()
-    blurs, changed, before = [0.0, 0.0], np.zeros(2, np.int64), int(counts[Reason.VALUE])
-    for end, box in boxes.items():
+    seen, blurs, changed, before = heights(), [0.0, 0.0], np.zeros(2, np.int64), int(counts[Reason.VALUE])
+    for end in near:
         known, widest = blur_of(seen, position, along, end == 1)
         blurs[end] = WIDER * widest
         _mind(
-            position.reshape(rows), sigma.reshape(rows), confidence.reshape(rows), reason.reshape(rows),
-            box, along, end == 1, blurs[end] if known else LEAST_BLUR_PX, blurs[end], pulls(), changed,
+            position, sigma, confidence, reason, rooms[end], along, end == 1,
+            blurs[end] if known else LEAST_BLUR_PX, blurs[end], pulls(), changed,
         )  # fmt: skip
     left_out, widened = changed.tolist()
     counts[Reason.VALUE] -= left_out
     counts[Reason.BORDER] += left_out
     return FieldEnd(along, (blurs[0], blurs[1]), widened, left_out, before - left_out)
-
-
-def boxes_near_ends(position: Map, width: int, along: int) -> dict[int, tuple[int, int, int, int]]:
-    """Where coordinates are near an end: by end, 0 the first and 1 the last, (top, bottom, left, right) in pixels.
-
-    Args:
-        position: (P,) float32. width, along: see `mind_ends`.
-    """
-    grid, corners = _grid(position.size, along), np.empty((2, 4), np.int64)
-    if not _near(position, width, *grid, corners):
-        return {}
-    height, around = position.size // width, 2 * grid[0]
-    return {
-        end: (max(top - around, 0), min(bottom + around, height), max(left - around, 0), min(right + around, width))
-        for end, (top, bottom, left, right) in enumerate(corners.tolist())
-        if bottom > top
-    }
 
 
 def margin_px(along: int) -> float:
@@ -217,23 +211,16 @@ def blur_of(heights: Heights | None, position: Map, along: int, last: bool) -> t
     """
     if heights is None:
         return False, SHARP_PX
-    room = position[heights.pixels] + np.float32(0.5)
-    room = along - room if last else room
     # What the end itself has cut off keeps its fine fringes longer.
-    clear, margin = margin_px(along) / 4, margin_px(along)
-    inside = np.flatnonzero((room > clear) & (room < along - clear))
-    near = inside[room[inside] < NEAR_SHARE * along]
-    ratios = heights.ratios[near if near.size >= NEAR_PIXELS else inside]
-    if ratios.size < FEWEST:
+    margin = margin_px(along)
+    middle, error = _middle_ratio(heights.pixels, heights.ratios, position, along, last, margin / 4, NEAR_SHARE * along)
+    if error == np.inf:
         return False, SHARP_PX
-    middle = float(np.median(ratios))
-    # A median's own error: 1.25 times a mean's, by the spread that the ratios' middle half has.
-    error = 1.2533 * 1.4826 * float(np.median(np.abs(ratios - middle))) / math.sqrt(ratios.size)
     blurs = (
         math.sqrt(-math.log(min(max(ratio, 1e-6), 1.0)) * heights.per_log_px2) for ratio in (middle, middle - 2 * error)
     )
     likely, widest = (min(max(blur, LEAST_BLUR_PX), margin / (REACH * WIDER)) for blur in blurs)
-    return likely > 2 * LEAST_BLUR_PX and middle < 1 - LEAST_LOST, widest
+    return bool(likely > 2 * LEAST_BLUR_PX and middle < 1 - LEAST_LOST), widest
 
 
 @cache
@@ -266,37 +253,82 @@ def keep_pull(values: Map, sigma: Map, count: NDArray[np.uint16], told: Mapping[
 
 def warm_up() -> None:
     """Compile what every scan comes to, and what only a view of the field's end does."""
-    position, sigma, confidence = np.zeros((3, 4), np.float32)
+    position, sigma, confidence = np.zeros((3, 64), np.float32)
+    sample = np.ones((2, 32), np.float32)
+    pixels, ratios = _ratios(
+        np.array([0, 32]), sample, sample, _NO_MAP, np.float32(1), sample, np.ones(sample.shape, np.bool_)
+    )
     counts = np.zeros(len(Reason), np.int64)
-    mind_ends(position, sigma, confidence, np.zeros(4, np.uint8), 2, 100, lambda: None, counts)
-
-
-@lru_cache(maxsize=16)
-def _grid(pixels: int, along: int) -> tuple[int, float, float]:
-    """(pixels from one point to the next, coordinates below which and above which one is near an end)."""
-    margin = margin_px(along)
-    return max(math.isqrt(pixels // GRID_POINTS), 1), margin - 0.5, along - margin - 0.5
+    mind_ends(
+        position, sigma, confidence, np.zeros(64, np.uint8), rooms_of(position, 100), 100,
+        lambda: Heights(pixels, ratios, 50.0), counts,
+    )  # fmt: skip
 
 
 @kernel
-def _near(position: Map, width: int, step: int, low: float, high: float, boxes: NDArray[np.int64]) -> bool:
-    """Whether a grid of pixels meets coordinates near an end; boxes: (2, 4) top, bottom, left, right of those near the
-    first end, and of those near the last."""
-    height = position.size // width
-    boxes[:, 0], boxes[:, 1], boxes[:, 2], boxes[:, 3] = height, 0, width, 0
-    found = False
-    for line in range((height + step - 1) // step):
-        for place in range((width + step - 1) // step):
-            # Sheared both ways: no straight edge passes between its lines.
-            y, x = line * step + place * 5 % step, place * step + line * 7 % step
-            if y < height and x < width:
-                value = position[y * width + x]
-                if value < low or value > high:
-                    box = boxes[0] if value < low else boxes[1]
-                    box[0], box[1] = min(box[0], y), max(box[1], y + 1)
-                    box[2], box[3] = min(box[2], x), max(box[3], x + 1)
-                    found = True
-    return found
+def _ratios(
+    runs: NDArray[np.intp],
+    height: NDArray[np.float32],
+    flat: NDArray[np.float32],
+    contrast: Map,
+    share: np.float32,
+    mean: NDArray[np.float32],
+    usable: NDArray[np.bool_],
+) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Pixels that are usable and lit, and their height over `share` of what is flat, or of the contrast if not empty.
+
+    Args:
+        runs: (R,) first pixels. height, flat, mean: (R, L) float32. contrast: (P,) or empty. usable: (R, L) bool.
+    """
+    pixels, ratios, count = np.empty(mean.size, np.intp), np.empty(mean.size, np.float32), 0
+    for r in range(mean.shape[0]):
+        for i in range(mean.shape[1]):
+            if usable[r, i] and mean[r, i] > 0:
+                whole = share * (contrast[runs[r] + i] if contrast.size > 0 else flat[r, i])
+                pixels[count], ratios[count] = runs[r] + i, height[r, i] / max(whole, np.float32(1e-3))
+                count += 1
+    return pixels[:count], ratios[:count]
+
+
+@kernel
+def _middle_ratio(
+    pixels: NDArray[np.intp],
+    ratios: NDArray[np.float32],
+    position: Map,
+    along: int,
+    last: bool,
+    clear: float,
+    near: float,
+) -> tuple[float, float]:
+    """Median of ratios at pixels farther than `clear` from both ends, and its error, infinite if these are too few; of
+    those nearer than `near` to the one end, if these are enough."""
+    inside, beside = np.empty(ratios.size, np.float32), np.empty(ratios.size, np.float32)
+    count, nearer = 0, 0
+    for i in range(ratios.size):
+        room = _room(position[pixels[i]], along, last)
+        if room > clear and room < along - clear:
+            inside[count] = ratios[i]
+            count += 1
+            if room < near:
+                beside[nearer] = ratios[i]
+                nearer += 1
+    of = beside[:nearer] if nearer >= NEAR_PIXELS else inside[:count]
+    if of.size < FEWEST:
+        return 1.0, np.inf
+    middle = nth_of(of, of.size // 2)
+    # A median's own error: 1.25 times a mean's, by the spread that the ratios' middle half has.
+    spread = nth_of(np.abs(of - middle), of.size // 2)
+    return float(middle), 1.2533 * 1.4826 * float(spread) / np.sqrt(of.size)
+
+
+@kernel
+def _lower(position: Map, along: int, rooms: NDArray[np.float32]) -> None:
+    """See `rooms_of`."""
+    for i in range(position.size):
+        first, last = _room(position[i], along, False), _room(position[i], along, True)
+        stretch = i // ROOM_STRETCH
+        # The lesser of two of which one may be NaN.
+        rooms[0, stretch], rooms[1, stretch] = np.fmin(rooms[0, stretch], first), np.fmin(rooms[1, stretch], last)
 
 
 @kernel
@@ -305,7 +337,7 @@ def _mind(
     sigma: Map,
     confidence: Map,
     reason: NDArray[np.uint8],
-    box: tuple[int, int, int, int],
+    rooms: NDArray[np.float32],
     along: int,
     last: bool,
     leaving: float,
@@ -313,32 +345,30 @@ def _mind(
     pulls: NDArray[np.float32],
     changed: NDArray[np.int64],
 ) -> None:
-    """One end's part of `mind_ends` within a box: top, bottom, left, right.
+    """One end's part of `mind_ends`.
 
-    leaving, blur: by which pixels are left out, and sigmas widened. changed: left out, widened, is added to.
+    rooms: (n,) of the end. leaving, blur: by which pixels are left out, and sigmas widened. changed: left out, widened,
+    is added to.
     """
-    top, bottom, left, right = box
     unit, most, least = np.float32(1 / blur), np.float32(REACH * blur), np.float32(_HALF_NORMAL_MEAN * leaving)
-    for y in range(top, bottom):
-        for begin in range(left, right, _TOGETHER):
-            stretch = slice(begin, min(begin + _TOGETHER, right))
-            if not _any_within(position[y, stretch], along, last, most):
+    for stretch in range(rooms.size):
+        if rooms[stretch] >= most:
+            continue
+        for i in range(stretch * ROOM_STRETCH, min((stretch + 1) * ROOM_STRETCH, position.size)):
+            room = _room(position[i], along, last)
+            if not (room < most and reason[i] == _VALUE):
                 continue
-            for x in range(begin, min(begin + _TOGETHER, right)):
-                room = _room(position[y, x], along, last)
-                if not (room < most and reason[y, x] == _VALUE):
-                    continue
-                if room < least:
-                    changed[0] += 1
-                    position[y, x], confidence[y, x], reason[y, x] = _NAN, np.float32(0), _BORDER
-                    if sigma.size > 0:
-                        sigma[y, x] = _NAN
-                elif sigma.size > 0:
-                    at = room * unit * np.float32(_TABLE_STEPS)
-                    step = int(at)
-                    pull = np.float32(blur) * (pulls[step] + (at - np.float32(step)) * (pulls[step + 1] - pulls[step]))
-                    changed[1] += pull > sigma[y, x]
-                    sigma[y, x] = np.sqrt(sigma[y, x] * sigma[y, x] + pull * pull)
+            if room < least:
+                changed[0] += 1
+                position[i], confidence[i], reason[i] = _NAN, np.float32(0), _BORDER
+                if sigma.size > 0:
+                    sigma[i] = _NAN
+            elif sigma.size > 0:
+                at = room * unit * np.float32(_TABLE_STEPS)
+                step = int(at)
+                pull = np.float32(blur) * (pulls[step] + (at - np.float32(step)) * (pulls[step + 1] - pulls[step]))
+                changed[1] += pull > sigma[i]
+                sigma[i] = np.sqrt(sigma[i] * sigma[i] + pull * pull)
 
 
 @kernel
@@ -346,12 +376,3 @@ def _room(position: np.float32, along: int, last: bool) -> np.float32:
     """From an end of the field inward, projector px."""
     inside = position + np.float32(0.5)
     return np.float32(along) - inside if last else inside
-
-
-@kernel
-def _any_within(positions: Map, along: int, last: bool, most: np.float32) -> bool:
-    # Without a way out of the loop: a vector at once is faster than one and then none.
-    found = np.int32(0)
-    for i in range(positions.size):
-        found |= np.int32(_room(positions[i], along, last) < most)
-    return bool(found)

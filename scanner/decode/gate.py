@@ -1,4 +1,5 @@
-"""Words that threads share inside kernels: a gate that one opens for the others, and turns that each takes once.
+"""Words that threads share inside kernels: a gate that one opens for the others, turns that each takes once, and how
+many are at work.
 
 A thread that sleeps is woken in thirty microseconds, and by the interpreter, whose lock it needs then; one that waits
 in a kernel goes on at once. So it is woken early, and waits here for what is not ready yet, for LONGEST at the most.
@@ -24,10 +25,10 @@ SHUT, OPEN, ABANDONED = 0, 1, 2
 
 
 _compiler = cast(Any, cgutils)
-_GATE, _TURN = 0, CACHE_LINE // 8
+_GATE, _TURN, _BUSY = 0, CACHE_LINE // 8, 2 * CACHE_LINE // 8
 """Words that different threads write lie on lines of their own."""
 
-_WORDS = 2 * CACHE_LINE // 8
+_WORDS = 3 * CACHE_LINE // 8
 
 LONGEST = 1 << 9
 """Rounds of looking at a gate before a thread goes to sleep after all: a millisecond, twice what it is shut for."""
@@ -62,6 +63,25 @@ def wait_for(gate: NDArray[np.int64]) -> int:
 
 
 @kernel
+def come_and_go(gate: NDArray[np.int64], more: int) -> None:
+    """1: one more is at work, to be said before its first turn. -1: it has taken its last, and all is written."""
+    _add(gate, _BUSY, np.int64(more))
+
+
+@kernel
+def all_gone(gate: NDArray[np.int64]) -> bool:
+    """Whether nobody is at work, or is no more after LONGEST looks. To be asked when there is no turn left: who comes
+    then has nothing to do."""
+    for _ in range(LONGEST):
+        for _ in range(_LOOKS):
+            if _load_acquire(gate, _BUSY) == 0:
+                return True
+            _pause()
+        _give_way()
+    return False
+
+
+@kernel
 def next_turn(gate: NDArray[np.int64]) -> int:
     """0, 1, 2, ...: each number to one caller."""
     return int(_add(gate, _TURN, np.int64(1)))
@@ -89,7 +109,7 @@ def _storing(typing_context: Any, words: Any, at: Any, value: Any) -> Any:
 
 def _adding(typing_context: Any, words: Any, at: Any, value: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        return builder.atomic_rmw("add", _word(context, builder, signature, values), values[2], "monotonic")
+        return builder.atomic_rmw("add", _word(context, builder, signature, values), values[2], "acq_rel")
 
     return types.int64(words, types.intp, types.int64), generate
 

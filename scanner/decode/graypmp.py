@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode import Decoded, Reason
-from scanner.decode.field_end import FieldEnd, heights_of, mind_ends
+from scanner.decode.field_end import FieldEnd, heights_of, mind_ends, rooms_of
 from scanner.decode.frames import FrameCheck
 from scanner.decode.graycode import GrayDecoder, GrayThresholds
 from scanner.decode.phase_and_code import PhaseAndCode, compare_phase_and_code, require_code_order
@@ -115,7 +115,7 @@ class GrayPmpDecoder:
         levels = sequence.white is not None and sequence.black is not None
         contrast = code.modulation.reshape(-1) if gray.inverse or levels or gray.bits >= FEWEST_BITS else None
         return mind_ends(
-            m.position, m.sigma, m.confidence, m.reason, self._camera.width, along,
+            m.position, m.sigma, m.confidence, m.reason, rooms_of(m.position, along), along,
             lambda: heights_of(self._pattern.pmp, along, found.sample, contrast), counts,
         )  # fmt: skip
 

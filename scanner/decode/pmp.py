@@ -215,7 +215,7 @@ class PmpDecoder:
             self._pattern, along, self._camera, frames, maps, self._thresholds, self._threads, brief=brief
         )
         self._ends[axis] = mind_ends(
-            maps.position, maps.sigma[: 0 if brief else None], maps.confidence, maps.reason, self._camera.width, along,
+            maps.position, maps.sigma[: 0 if brief else None], maps.confidence, maps.reason, found.rooms, along,
             lambda: heights_of(self._pattern, along, found.sample), found.counts,
         )  # fmt: skip
         return found

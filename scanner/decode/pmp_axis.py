@@ -18,6 +18,7 @@ from scanner.decode.addresses import maps_to_fill
 from scanner.decode.agreement import Remainder, remainders
 from scanner.decode.cut_at_black import unmove_dark
 from scanner.decode.doubled import may_be_doubled
+from scanner.decode.field_end import far_rooms, margin_px
 from scanner.decode.neighbours import settle
 from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel
 from scanner.decode.one_surface import doubt_axis, doubtful_steps
@@ -175,6 +176,8 @@ class AxisFound:
     may_be_doubled: bool
     """residuals are large enough for one frame to show what another one shows"""
     sample: Sample
+    rooms: NDArray[np.float32]
+    """(2, n) distances from the field's ends, of `field_end.mind_ends`"""
 
 
 def decode_axis(
@@ -199,12 +202,13 @@ def decode_axis(
     pixels, finest, clip, sigmas = camera.width * camera.height, plan.finest, t.clip(camera), t.min_modulation_sigmas
     modulation_limits = t.min_modulation_levels, t.min_modulation_share, sigmas
     sigma, albedo, modulation = (m[: 0 if brief else None] for m in (maps.sigma, maps.albedo, maps.modulation))
-    floors, model, limits = np.empty(len(plan.ratios), np.float32), np.empty(5, np.float32), np.empty(7, np.float32)
+    floors, model, limits = np.empty(len(plan.ratios), np.float32), np.empty(5, np.float32), np.empty(8, np.float32)
+    rooms = far_rooms(pixels)
     arguments = (
         frames.addresses, frames.like, frames.starts, frames.weights, frames.grams, frames.whole, clip,
         plan.gains, plan.rungs, plan.ratios, plan.errors2, floors, model, plan.scale, limits,
         plan.ladder.periodic, finest,
-        maps.position, sigma, maps.confidence, albedo, modulation, maps.reason, begins_of(pixels, threads),
+        maps.position, sigma, maps.confidence, albedo, modulation, maps.reason, rooms, begins_of(pixels, threads),
     )  # fmt: skip
     with Shared(lambda gate, counts: decode_strips(*arguments, gate, counts), threads, REASONS) as shared:
         sample, seen = take_sample(frames, plan, pixels, camera.max_value, clip, modulation_limits)
@@ -215,7 +219,7 @@ def decode_axis(
         model[:] = noise.read, noise.per_level, ROUNDING_VARIANCE, sample.prior, 1 / (sample.prior + frames.freedom)
         limits[:] = (
             least, sigmas**2, t.max_residual_sigmas**2, t.max_residual_share**2 + sample.overtone_share2(finest),
-            t.max_remainder_sigmas**2, 1 - t.min_unwrap_probability, t.edge_sigmas,
+            t.max_remainder_sigmas**2, 1 - t.min_unwrap_probability, t.edge_sigmas, margin_px(along),
         )  # fmt: skip
         shared.open()
         # What a report tells is no business of the pass: others are in it by now.
@@ -240,6 +244,8 @@ def decode_axis(
         settled = settle(maps.position, maps.sigma, maps.confidence, maps.reason, camera.width, 1 / plan.per_cycle)
         counts[Reason.UNWRAP_RISK] -= settled
         counts[Reason.VALUE] += settled
+        # Each has its tentative coordinate's distances, or is one fringe off.
+        rooms -= np.float32(plan.per_cycle if settled else 0)
     if counts[Reason.MOVED]:
         dark = unmove_dark(maps.reason, frames, least, t.min_modulation_sigmas, camera.max_value)
         counts[Reason.MOVED] -= dark
@@ -254,7 +260,7 @@ def decode_axis(
     return AxisFound(
         maps, plan.ladder, noise, found, settled, off_surface, ripple, light, random_px, counts,
         may_be_doubled(noise, sample.mean.reshape(-1), sample.modulations[finest].reshape(-1), frames),
-        sample,
+        sample, rooms,
     )  # fmt: skip
 
 

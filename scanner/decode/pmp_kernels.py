@@ -32,6 +32,7 @@ from scanner.lanes import (
     greatest,
     least,
     load,
+    lowest,
     magnitude,
     nearest,
     root,
@@ -43,6 +44,7 @@ _F0 = np.float32(0)
 _F1 = np.float32(1)
 _HALF = np.float32(0.5)
 _NAN = np.float32(np.nan)
+_HUGE = np.float32(np.inf)
 _PER_TURN2 = np.float32(1 / (2 * np.pi) ** 2)
 
 AHEAD = 1024
@@ -50,6 +52,9 @@ AHEAD = 1024
 
 STRETCH = 16384
 """Pixels whose reasons are counted together."""
+
+ROOM_STRETCH = 1024
+"""Pixels that share one distance from each end of the field; strips that threads share begin at multiples of it."""
 
 
 @contracting_kernel
@@ -79,6 +84,7 @@ def decode_pixels(
     albedo: NDArray[np.float32],
     modulation: NDArray[np.float32],
     reason: NDArray[np.uint8],
+    rooms: NDArray[np.float32],
     counts: NDArray[np.int64],
 ) -> None:
     """Decode pixels begin .. end - 1 of one axis.
@@ -99,10 +105,13 @@ def decode_pixels(
         scale: [pixels along the axis, origin, coarsest rung's phase at the field's centre, finest frequency, first
             pixel's edge as a fraction of the field].
         limits: [modulation, modulation over its noise squared, residual variance over noise variance, residual
-            variance over B^2, remainder over its sigma squared, wrong-order probability, edge in sigmas].
+            variance over B^2, remainder over its sigma squared, wrong-order probability, edge in sigmas, distance
+            from an end of the field within which it is told].
         periodic: both ends of the field look alike. finest: index of the finest set.
         position, sigma, confidence, albedo, modulation: (P,) float32, written; sigma, albedo and modulation may be
             empty, and are left out then. reason: (P,) uint8, written.
+        rooms: (2, ceil(P / ROOM_STRETCH)) float32, lowered: projector px from the field's first and last end to the
+            nearest pixel of a stretch that has a coordinate, where any is as near as the last of `limits`.
         counts: (REASONS,) int64, how many pixels have each reason, is added to.
     """
     align_stack()
@@ -124,7 +133,7 @@ def decode_pixels(
         _decode_lanes(
             addresses, like, starts, weights, grams, shifts, turns, clip, gains, rungs, ratios, errors, floors, noise,
             scale, limits, periodic, finest, beats, terms, parts, combined, unit, spot, at, at, aligned,
-            position, sigma, confidence, albedo, modulation, reason,
+            position, sigma, confidence, albedo, modulation, reason, rooms,
         )  # fmt: skip
     if solid < end:
         # What is left goes into vectors of its own: nothing may be read beyond a frame's last pixel.
@@ -133,7 +142,7 @@ def decode_pixels(
         _decode_lanes(
             copies, like, starts, weights, grams, shifts, turns, clip, gains, rungs, ratios, errors, floors, noise,
             scale, limits, periodic, finest, beats, terms, parts, combined, unit, spot, solid, 0, False,
-            last[0], last[1], last[2], last[3], last[4], last_reason,
+            last[0], last[1], last[2], last[3], last[4], last_reason, rooms,
         )  # fmt: skip
         keep(spare)
         position[solid:end], confidence[solid:end] = last[0, :size], last[2, :size]
@@ -180,6 +189,7 @@ def _decode_lanes(
     albedo: NDArray[np.float32],
     modulation: NDArray[np.float32],
     reason: NDArray[np.uint8],
+    rooms: NDArray[np.float32],
 ) -> None:
     """Decode LANES pixels from `at` on, into the maps from `to` on."""
     sets = gains.size
@@ -204,10 +214,12 @@ def _decode_lanes(
     spread = ((along / fine) ** 2 * gains[finest] * _PER_TURN2) * variance
     # Farther from both ends than so many sigmas, without a root: squares that keep their sign.
     edge = limits[6] if periodic else -limits[6]
-    room = least(value + _HALF, (along - _HALF) - value)
+    first, last = value + _HALF, (along - _HALF) - value
+    room = least(first, last)
     # What is lit has a sigma of no more than this; nearly all pixels are farther from the ends than by that.
-    inside = room > (abs(edge) * along / fine) * np.sqrt(_PER_TURN2 / limits[1])
-    if not all_of(inside):
+    inside = room > max((abs(edge) * along / fine) * np.sqrt(_PER_TURN2 / limits[1]), limits[7])
+    far = all_of(inside)
+    if not far:
         inside = (room * magnitude(room)) * square > (edge * abs(edge)) * spread
     freedom = max(_F1 / shrink - prior, _F1)
     still = residual <= greatest((limits[2] * freedom) * model, (limits[3] * freedom) * square)
@@ -222,6 +234,10 @@ def _decode_lanes(
         why = choose(clear, why, 2)
         known = good | ((why > 3) & (why < 5))
         value, wrong = choose(known, value, _NAN), choose(good, wrong, _F1)
+    if not far:
+        stretch = at // ROOM_STRETCH
+        rooms[0, stretch] = min(rooms[0, stretch], lowest(choose(known, first, _HUGE)))
+        rooms[1, stretch] = min(rooms[1, stretch], lowest(choose(known, last, _HUGE)))
     _put(position, to, value, past_caches)
     _put(confidence, to, _F1 - wrong, past_caches)
     store(reason, to, why)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.gate import OPEN, SHUT, next_turn, wait_for
+from scanner.decode.gate import OPEN, SHUT, come_and_go, next_turn, wait_for
 from scanner.decode.pmp_kernels import decode_pixels
 from scanner.kernel import kernel
 
@@ -37,6 +37,7 @@ def decode_strips(
     albedo: NDArray[np.float32],
     modulation: NDArray[np.float32],
     reason: NDArray[np.uint8],
+    rooms: NDArray[np.float32],
     begins: NDArray[np.intp],
     gate: NDArray[np.int64],
     counts: NDArray[np.int64],
@@ -44,18 +45,20 @@ def decode_strips(
     """Decode strips until there is none left; False, and nothing is done, if the gate stays shut too long.
 
     Args:
-        addresses ... reason, counts: see `decode_pixels`; floors, noise and limits may be written until the gate opens.
+        addresses ... rooms, counts: see `decode_pixels`; floors, noise and limits may be written until the gate opens.
         begins: (S + 1,) first pixels of strips, and their end. gate: of `new_gate`.
     """
     state = wait_for(gate)
     if state != OPEN:
         return state != SHUT
+    come_and_go(gate, 1)
     strip = next_turn(gate)
     while strip < begins.size - 1:
         decode_pixels(
             addresses, like, starts, weights, grams, shifts, clip, gains, rungs, ratios, errors, floors, noise, scale,
             limits, periodic, finest, begins[strip], begins[strip + 1],
-            position, sigma, confidence, albedo, modulation, reason, counts,
+            position, sigma, confidence, albedo, modulation, reason, rooms, counts,
         )  # fmt: skip
         strip = next_turn(gate)
+    come_and_go(gate, -1)
     return True

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.gate import ABANDONED, OPEN, new_gate, set_gate
+from scanner.decode.gate import ABANDONED, OPEN, all_gone, new_gate, set_gate
 
 STRIPS = 6
 """Strips of the image for each thread: few enough to cost nothing, enough to even out a thread that is held up."""
@@ -68,9 +68,9 @@ class Shared:
     """
 
     def __init__(self, work: Callable[[NDArray[np.int64], NDArray[np.int64]], bool], threads: int, counts: int) -> None:
-        """work(gate, counts): waits at the gate and takes strips; False if the gate stayed shut too long (see
-        `pmp_strips.decode_strips`). counts: how many numbers it adds to."""
-        self._work, self._gate, self._opened = work, new_gate(), False
+        """work(gate, counts): waits at the gate, comes, takes strips and goes; False if the gate stayed shut too long
+        (see `pmp_strips.decode_strips`). counts: how many numbers it adds to."""
+        self._work, self._gate, self._opened, self._finished = work, new_gate(), False, False
         self._counts = np.zeros((threads, counts), np.int64)
         self._others: dict[int, Future[bool]] = {}
         self._call(range(1, threads))
@@ -94,7 +94,10 @@ class Shared:
     def finish(self) -> NDArray[np.int64]:
         """Take strips as well, until all is done; sums of counts."""
         self._work(self._gate, self._counts[0])
-        self._join()
+        # Others are seen to leave before the interpreter hears of it; one that did not come yet finds nothing to do.
+        self._finished = all_gone(self._gate)
+        if not self._finished:
+            self._join()
         return np.asarray(self._counts.sum(axis=0))
 
     def _join(self) -> None:
@@ -109,7 +112,7 @@ class Shared:
     def __exit__(self, *_: object) -> None:
         if not self._opened:
             set_gate(self._gate, ABANDONED)
-        if not all(other.done() for other in self._others.values()):
+        if not (self._finished or all(other.done() for other in self._others.values())):
             self._join()
 
 

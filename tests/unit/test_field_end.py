@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from scanner.decode import Reason, decoder_for
-from scanner.decode.field_end import REACH, WIDER, FieldEnd, Heights, blur_of, mind_ends, pulls
+from scanner.decode import Reason, decoder_for, pmp
+from scanner.decode.field_end import REACH, WIDER, FieldEnd, Heights, blur_of, margin_px, mind_ends, pulls, rooms_of
 from scanner.decode.graycode import GrayDecoder, GrayThresholds
 from scanner.decode.pmp import PmpDecoder
 from scanner.decode.reasons import REASONS
@@ -113,6 +113,26 @@ def test_a_code_says_nothing_beyond_the_end(pattern, blur_px, levels, bits):
     np.testing.assert_array_equal(brief.confidence, whole.confidence)
 
 
+@pytest.mark.parametrize("ends", [(-9, ALONG + 8), (40, 260), (100, 400)])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_decoding_tells_how_near_an_end_each_stretch_of_pixels_comes(ends, threads, monkeypatch):
+    sequence = PatternSequence(PROJECTOR["x"], CASES[0][0])
+    camera, _, frames = take(sequence, 2.0, ends=ends)
+    told = []
+    monkeypatch.setattr(pmp, "mind_ends", lambda position, *others: told.append((position.copy(), others[3])))
+    decoder = PmpDecoder(sequence, camera, threads=threads)
+    for position, frame in enumerate(frames):
+        decoder.keep(position, frame)
+    decoder.finish()
+    (position, rooms), margin = told[0], margin_px(ALONG)
+    true = rooms_of(position, ALONG)
+    near = np.minimum(true, rooms) < margin
+    assert near.any() == (ends != (40, 260))
+    # Of a pixel whose neighbours moved it by a fringe at the most its tentative place is told.
+    np.testing.assert_allclose(rooms[near], true[near], atol=ALONG / 20)
+    assert (rooms <= true + 1e-3)[near].all()
+
+
 def test_coordinates_alone_end_where_those_with_sigmas_do():
     pattern, blur_px, bits, axis = CASES[0]
     sequence = PatternSequence(PROJECTOR[axis], pattern)
@@ -167,7 +187,7 @@ def test_its_kernels_do_what_plain_numpy_does():
     out = room < np.sqrt(2 / np.pi)
     widened = np.where(out, np.nan, np.hypot(sigma, pull))
     drawn = int(np.count_nonzero(~out & (pull > sigma)))
-    told = mind_ends(position, sigma, confidence, reason, 80, along, lambda: heights, counts)
+    told = mind_ends(position, sigma, confidence, reason, rooms_of(position, along), along, lambda: heights, counts)
     assert told.blur_px == pytest.approx([WIDER * blur] * 2)
     assert (told.left_out, told.widened) == (out.sum(), drawn)
     assert (reason == np.where(out, Reason.BORDER, np.where(np.isnan(room), Reason.UNWRAP_RISK, 0))).all()

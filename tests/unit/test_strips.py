@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 
 from scanner.decode import strips
-from scanner.decode.gate import ABANDONED, OPEN, SHUT, new_gate, next_turn, set_gate, wait_for
+from scanner.decode.gate import (
+    ABANDONED,
+    OPEN,
+    SHUT,
+    all_gone,
+    come_and_go,
+    new_gate,
+    next_turn,
+    set_gate,
+    wait_for,
+)
 from scanner.decode.strips import MIN_STRIP, Shared, begins_of
 
 
@@ -32,6 +42,15 @@ def test_a_gate_lets_through_when_it_is_told_to():
         assert wait_for(gate) == state
 
 
+def test_who_is_at_work_is_waited_for_but_not_for_ever():
+    gate = new_gate()
+    assert all_gone(gate)
+    come_and_go(gate, 1)
+    assert not all_gone(gate)
+    come_and_go(gate, -1)
+    assert all_gone(gate)
+
+
 def test_each_turn_is_taken_once():
     gate = new_gate()
     with ThreadPoolExecutor(4) as pool:
@@ -49,9 +68,11 @@ def work_of(strips, taken, patience=True):
         state = wait_for(gate)
         if state != OPEN:
             return state != SHUT
+        come_and_go(gate, 1)
         while (strip := next_turn(gate)) < strips:
             taken.append(strip)
             counts[:] += (1, strip)
+        come_and_go(gate, -1)
         return True
 
     return work
