@@ -2,7 +2,8 @@
 
 A line through (stripe index, PMP row) at every stripe peak, by least squares, outliers out. The dissertation needs it
 to turn codes into phase; the default decoder knows the pattern and its rows, so here it is a check: the line must be
-the ideal one, row = h index + h / 2 - 0.5, and what it deviates by is an error of response, focus or decoding.
+the ideal one, row = h index + h / 2 - 0.5, and what it deviates by is an error of response, focus or decoding. Patterns
+along x have columns in place of rows throughout.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from scanner.errors import DecodeError
 
@@ -22,14 +24,32 @@ FEWEST_PEAKS = 200
 ROUNDS = 6
 OUTLIER_SIGMAS = 4.0
 """Peaks farther from the line than this, in robust sigmas, are wrong codes or edges: one of 16,000 right ones goes."""
+COVERAGE = 0.9545
+"""What k = 2 holds of a normal error, and Student's factor of one that few stripes tell"""
 NOTABLE_PX = 0.2
-"""Deviation from the ideal line, rows, from which something is wrong: a tenth of what a peak scatters on a board."""
+"""Rows, of the line from the ideal one and of the peaks from the line, from which something is wrong: ten times what
+peaks scatter on a plain board (0.02 rows), 0.6 mm of depth on the dissertation's rig."""
+NOTABLE_OUTLIERS = 0.05
+"""Share of peaks off the line, beyond which the surface is no plain flat board: 0.1 to 2 % on boards, 10 to 18 % on a
+bust, on blocks and on print."""
+MOST_ELSEWHERE = 0.05
+"""Share of peaks where the two scans name different stripes, by no whole number of stripes: of two scenes. On one
+scene, steps and print included, it is 0.1 % at most; where a ball hides a tenth of a wall, a tenth."""
+MOST_WRONG = 0.5
+"""Share of peaks in another stripe, by whole stripes too: the dissertation's decoder has 80 to 93 % of codes right
+in the end (Casey 2011, tables 5.1 and 5.2)"""
+WHOLE_SHARE = 0.125
+"""Of a stripe, about its whole multiples, on either side: a wrong code moves a peak by those, another scene moves it
+anywhere, one time in four by chance near one"""
 
 
 @dataclass(frozen=True)
 class McpPhase:
     """The line row = slope index + intercept; deviation_px: largest distance from the ideal one over all stripes;
-    rms_px: of the peaks kept; stripes, peaks, outliers: how many."""
+    rms_px: of the peaks kept; stripes, peaks, outliers: how many; wrong_codes: outliers that are whole stripes off.
+
+    expanded: U of slope, intercept, deviation_px and rms_px, each None where too few stripes tell.
+    """
 
     slope: float
     intercept: float
@@ -38,11 +58,26 @@ class McpPhase:
     stripes: int
     peaks: int
     outliers: int
+    wrong_codes: int
+    expanded: dict[str, float | None]
 
     @property
     def member(self) -> dict[str, float]:
         """`mcp_phase` of the calibration file."""
         return {"slope": self.slope, "intercept": self.intercept}
+
+    @property
+    def outlying(self) -> float:
+        """Share of the peaks that are off the line."""
+        return self.outliers / (self.peaks + self.outliers)
+
+    @property
+    def good(self) -> bool | None:
+        """Whether nothing is wrong; None: the deviation is within NOTABLE_PX, but not surely so."""
+        if max(self.deviation_px, self.rms_px) > NOTABLE_PX or self.outlying > NOTABLE_OUTLIERS:
+            return False
+        unsure = self.expanded["deviation_px"]
+        return None if unsure is None or self.deviation_px + unsure > NOTABLE_PX else True
 
 
 def mcp_phase(rows: NDArray[Any], peaks: NDArray[Any], pitch_px: float, *, axis: str = "y") -> McpPhase:
@@ -55,21 +90,15 @@ def mcp_phase(rows: NDArray[Any], peaks: NDArray[Any], pitch_px: float, *, axis:
         axis: of the pattern; only for messages.
 
     Raises:
-        DecodeError: too few peaks on pixels that PMP measured, or all on one stripe.
+        DecodeError: too few peaks on pixels that PMP measured, or all on one stripe; the scans are of two scenes.
     """
-    whole = peaks[np.asarray(peaks[:, 3]) == np.round(peaks[:, 3])].astype(np.float64)
-    x, y = (whole[:, k].astype(np.float32) for k in (0, 1))
-    seen = cv2.remap(np.asarray(rows, np.float32), x[:, None], y[:, None], cv2.INTER_LINEAR, borderValue=float("nan"))[
-        :, 0
-    ].astype(np.float64)
-    known = np.isfinite(seen)
-    index, seen = whole[known, 3], seen[known]
+    index, seen = _on_measured(rows, peaks)
     if len(index) < FEWEST_PEAKS or np.ptp(index) == 0:
         raise DecodeError(
             f"{len(index)} stripe peaks lie on pixels that PMP measured: {FEWEST_PEAKS} are needed, on several stripes",
-            hint="scan a matt white flat board that fills the field, by PMP and by MCP, both along axis "
-            f"{axis}, without moving anything between",
+            hint=_SCAN_AGAIN.format(axis=axis),
         )
+    _require_one_scene(seen - (pitch_px * index + pitch_px / 2 - 0.5), pitch_px, axis)
     kept = np.ones(len(index), dtype=bool)
     slope, intercept = pitch_px, pitch_px / 2 - 0.5
     for _ in range(ROUNDS):
@@ -78,15 +107,89 @@ def mcp_phase(rows: NDArray[Any], peaks: NDArray[Any], pitch_px: float, *, axis:
         spread = max(1.4826 * float(np.median(np.abs(off - np.median(off[kept])))), 1e-3)
         kept = np.abs(off - np.median(off[kept])) < OUTLIER_SIGMAS * spread
         slope, intercept = (float(v) for v in np.polyfit(index[kept], seen[kept], 1))
-    off = (seen - slope * index - intercept)[kept]
+    off = seen - slope * index - intercept
     ends = np.array([index[kept].min(), index[kept].max()])
     deviation = (slope - pitch_px) * ends + intercept - (pitch_px / 2 - 0.5)
+    worst = float(ends[np.argmax(np.abs(deviation))])
     return McpPhase(
         slope,
         intercept,
         float(np.abs(deviation).max()),
-        float(np.sqrt((off**2).mean())),
+        float(np.sqrt((off[kept] ** 2).mean())),
         len(np.unique(index[kept])),
         int(kept.sum()),
         int((~kept).sum()),
+        int((~kept & _other_stripe(off, pitch_px) & _whole(off, pitch_px)).sum()),
+        _expanded(index[kept], off[kept], worst),
     )
+
+
+_SCAN_AGAIN = (
+    "scan a matt white flat board that fills the field, by PMP and by MCP, both along axis {axis}, without moving "
+    "anything between"
+)
+
+
+def _on_measured(rows: NDArray[Any], peaks: NDArray[Any]) -> tuple[Array, Array]:
+    """Stripe index, and PMP's row, of every peak of a whole stripe that lies on pixels that PMP measured."""
+    whole = peaks[np.asarray(peaks[:, 3]) == np.round(peaks[:, 3])].astype(np.float64)
+    x, y = (whole[:, k].astype(np.float32) for k in (0, 1))
+    seen = cv2.remap(np.asarray(rows, np.float32), x[:, None], y[:, None], cv2.INTER_LINEAR, borderValue=float("nan"))[
+        :, 0
+    ].astype(np.float64)
+    known = np.isfinite(seen)
+    return whole[known, 3], seen[known]
+
+
+def _require_one_scene(off: Array, pitch_px: float, axis: str) -> None:
+    """A peak lies in its stripe, half a pitch from the middle at most, or its code is wrong by whole stripes. Neither
+    gamma nor blur moves it farther, and no decoder has most codes wrong.
+
+    Raises:
+        DecodeError: more peaks than MOST_ELSEWHERE do neither, or most are in another stripe.
+    """
+    lines = "rows" if axis == "y" else "columns"
+    other = _other_stripe(off, pitch_px)
+    share = float(np.mean(other & ~_whole(off, pitch_px)))
+    if other.mean() > MOST_WRONG or share > MOST_ELSEWHERE:
+        raise DecodeError(
+            f"the two scans are not of one scene: at {other.mean():.0%} of the stripe peaks PMP has {lines} of another "
+            f"stripe than MCP names, {pitch_px / 2:g} {lines} or more off its middle, at {share:.0%} by no whole "
+            f"number of stripes, as a wrong code would make; {MOST_ELSEWHERE:.0%} are allowed",
+            hint=_SCAN_AGAIN.format(axis=axis),
+        )
+
+
+def _other_stripe(off: Array, pitch_px: float) -> NDArray[np.bool_]:
+    return np.asarray(np.abs(off) > pitch_px / 2)
+
+
+def _whole(off: Array, pitch_px: float) -> NDArray[np.bool_]:
+    """Near a whole number of stripes, where a wrong code puts a peak."""
+    steps = off / pitch_px
+    return np.asarray(np.abs(steps - np.round(steps)) < WHOLE_SHARE)
+
+
+def _expanded(index: Array, off: Array, worst: float) -> dict[str, float | None]:
+    """U of the line's figures, by how much stripes as wholes differ: along a stripe peaks are fitted together, so that
+    their errors are alike and their number tells nothing (cluster-robust: Liang and Zeger 1986, Biometrika 73, 13)."""
+    stripes, at = np.unique(index, return_inverse=True)
+    freedom = len(stripes) - 2
+    if freedom < 1:
+        return dict.fromkeys(("slope", "intercept", "deviation_px", "rms_px"))
+    design = np.column_stack((index, np.ones_like(index)))
+    inverse = np.linalg.inv(design.T @ design)
+    scores = np.column_stack([np.bincount(at, design[:, k] * off) for k in (0, 1)])
+    covariance = inverse @ (scores.T @ scores) @ inverse * len(stripes) / freedom
+    end = np.array([worst, 1.0])
+    rms = float(np.sqrt((off**2).mean()))
+    squares = np.bincount(at, off**2 - rms**2)
+    of_rms = float(np.sqrt(squares @ squares * len(stripes) / freedom)) / (len(off) * 2 * max(rms, 1e-12))
+    spreads = {
+        "slope": float(np.sqrt(covariance[0, 0])),
+        "intercept": float(np.sqrt(covariance[1, 1])),
+        "deviation_px": float(np.sqrt(max(end @ covariance @ end, 0.0))),
+        "rms_px": of_rms,
+    }
+    factor = float(student.ppf((1 + COVERAGE) / 2, freedom))
+    return {name: factor * spread for name, spread in spreads.items()}

@@ -6,6 +6,7 @@ import typer
 
 from service.commands import (
     calibrate_marks,
+    calibrate_mcp,
     calibrate_response,
     calibrate_run,
     calibrate_solve,
@@ -24,6 +25,6 @@ group.command("solve")(calibrate_solve.solve)
 group.command("target")(calibrate_target.target)
 group.command("verify")(calibrate_verify.verify)
 group.command("marks")(calibrate_marks.marks)
-group.command("mcp")(calibrate_verify.mcp)
+group.command("mcp")(calibrate_mcp.mcp)
 group.command("sync")(calibrate_sync.sync)
 group.command("response")(calibrate_response.response)

@@ -1,4 +1,4 @@
-"""`fringed calibrate verify` and `mcp`: what a calibrated rig's scans are worth, by features that are known."""
+"""`fringed calibrate verify`: what a calibrated rig's scans are worth, by features that are known."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import typer
 from scanner.digits import alone, rounded, with_uncertainty
 from scanner.stated_length import dominates
 from service.commands.calibrate_marks import region_given
-from service.commands.calibrate_solve import Replace
-from service.commands.options import AsJson, output_path
+from service.commands.options import AsJson
 from service.terminal import print_error, print_facts, print_json, print_table, progress_lines
 
 
@@ -126,69 +125,6 @@ def verify(
         return 1
     if tolerance is not None:
         print_error(_met(document, worst, tolerance), label="note")
-    return 0
-
-
-def mcp(
-    pmp: Annotated[Path, typer.Argument(metavar="PMP-SCAN", help="A PMP scan of a matt white flat board.")],
-    single: Annotated[Path, typer.Argument(metavar="MCP-SCAN", help="An MCP scan of it, nothing moved between.")],
-    calibration: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Calibration file to which the fit is to be added.")
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="FILE", parser=output_path, help="With --calibration: the new file."),
-    ] = None,
-    force: Replace = False,
-    as_json: AsJson = False,
-) -> int:
-    """Check MCP's stripes against PMP's rows on one flat board: the code-to-phase fit of the dissertation.
-
-    The decoder knows the pattern, so the fit is a check: its line must be the ideal one.
-
-    \b
-    Examples:
-      fringed scan --rig simulated:casey2011/board -o scans/board-pmp
-      fringed scan --rig simulated:casey2011/board --method mcp -o scans/board-mcp
-      fringed calibrate mcp scans/board-pmp scans/board-mcp
-      fringed calibrate mcp board-pmp/ board-mcp/ --calibration rig.json -o rig-mcp.json
-    """
-    if (calibration is None) != (output is None):
-        raise typer.BadParameter("--calibration FILE and -o FILE belong together")
-    if output is not None and output.exists() and not force:
-        raise typer.BadParameter(f"-o: {output} exists; --force replaces it")
-    from scanner.calibration.calibration_file import as_text  # noqa: PLC0415
-    from scanner.calibration.mcp_phase import NOTABLE_PX, mcp_phase  # noqa: PLC0415
-    from scanner.calibration_id import content_id  # noqa: PLC0415
-    from scanner.geometry import load_calibration  # noqa: PLC0415
-    from scanner.storage import replace_file, try_file  # noqa: PLC0415
-
-    if output is not None:
-        try_file(output)
-    rows, peaks, pitch, axis = _both(pmp, single)
-    fit = mcp_phase(rows, peaks, pitch, axis=axis)
-    if calibration is not None and output is not None:
-        content = {**load_calibration(calibration).as_dict(), "mcp_phase": fit.member}
-        content["id"] = content_id(content)
-        replace_file(output, as_text(content).encode())
-    ideal = {"slope": pitch, "intercept": pitch / 2 - 0.5}
-    if as_json:
-        print_json({**vars(fit), "ideal": ideal, "file": output and str(output)})
-    else:
-        facts: list[tuple[str, Any]] = [
-            ("line", f"row = {fit.slope:.5f} x stripe + {fit.intercept:.4f}"),
-            ("ideal", f"row = {ideal['slope']:.5f} x stripe + {ideal['intercept']:.4f}"),
-            ("deviation", f"{fit.deviation_px:.4f} rows at most"),
-            ("scatter", f"{fit.rms_px:.4f} rows rms"),
-            ("peaks", f"{fit.peaks:,} on {fit.stripes} stripes, {fit.outliers:,} outliers left out"),
-        ]
-        print_facts("code to phase", facts if output is None else [*facts, ("file", output)])
-    if fit.deviation_px > NOTABLE_PX:
-        print_error(
-            f"stripes and PMP rows differ by up to {fit.deviation_px:.2f} rows",
-            "correct the projector's gamma, focus it, and see that nothing moved between the scans",
-            label="warning",
-        )
     return 0
 
 
@@ -363,25 +299,3 @@ def _cell(value: float | None, spread: dict[str, float | None] | None = None) ->
     if spread is not None:
         return with_uncertainty(value, spread["expanded"])
     return f"{value:,}" if isinstance(value, int) else rounded(value)
-
-
-def _both(pmp: Path, single: Path) -> tuple[Any, Any, float, str]:
-    """PMP's map along MCP's axis, MCP's peaks, its pitch and axis."""
-    from scanner.capture import Capture  # noqa: PLC0415
-    from scanner.errors import DecodeError  # noqa: PLC0415
-    from scanner.patterns import McpPattern  # noqa: PLC0415
-    from scanner.scan import load_scan  # noqa: PLC0415
-
-    dense, stripes = load_scan(pmp), load_scan(single)
-    sequence = Capture.open(single / "capture").header.sequence
-    if stripes.peaks is None or not isinstance(sequence.pattern, McpPattern):
-        raise DecodeError(f"{single} is no MCP scan", hint="fringed scan --method mcp")
-    axis = sequence.pattern.axis
-    rows = dense.rows if axis == "y" else dense.columns
-    if rows is None:
-        raise DecodeError(
-            f"{pmp} was not projected along axis {axis}, as {single} was", hint=f"fringed scan --axis {axis}"
-        )
-    if rows.shape != stripes.shape:
-        raise DecodeError(f"{pmp} and {single} have pictures of different sizes")
-    return rows, stripes.peaks, sequence.pattern.pitch_px(sequence.projector), axis

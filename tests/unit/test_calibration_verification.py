@@ -1,4 +1,4 @@
-"""Features measured in made-up scans: flatness, a sphere, a length, repeatability, and MCP's line against PMP."""
+"""Features measured in made-up scans: flatness, a sphere, a length and repeatability."""
 
 from __future__ import annotations
 
@@ -10,13 +10,9 @@ import numpy as np
 import pytest
 
 from scanner.calibration import figure_spread
-from scanner.calibration.mcp_phase import mcp_phase
 from scanner.calibration.targets import parse_target
 from scanner.calibration.verification import flat_board, local_point, repeatability, sphere, target_length
-from scanner.capture import CaptureHeader
 from scanner.errors import DecodeError
-from scanner.geometry import load_calibration
-from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
 from scanner.scan import Scan
 from service.cli import main
 from tests.unit.test_calibration_marks import PLACES, field
@@ -155,54 +151,6 @@ def test_length_between_the_ends_of_a_row() -> None:
         target_length(albedo, xyz, target)
 
 
-# --- MCP ------------------------------------------------------------------------------------------------------------
-
-
-def stripes(slope: float, intercept: float, wrong: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """A map of rows over a board, and peaks of 32 stripes in it that lie on a line, some with a wrong index."""
-    y, x = np.mgrid[:400, :300].astype(np.float64)
-    rows = 20 + 2.0 * y + 0.05 * x
-    generator = np.random.default_rng(4)
-    peaks = []
-    for index in range(32):
-        for column in range(0, 300, 10):
-            row = slope * index + intercept + generator.normal(0, 0.05)
-            at = (row - 20 - 0.05 * column) / 2
-            if 0 < at < 399:
-                peaks.append((column, at, row, index, 1.0))
-    table = np.array(peaks, dtype=np.float32)
-    if wrong:
-        table[:: len(table) // wrong, 3] += 3
-    half = table[:50].copy()
-    half[:, 3] += 0.5  # the minimum after a stripe: no stripe of its own
-    return rows.astype(np.float32), np.concatenate((table, half))
-
-
-def test_line_of_the_stripes_is_found() -> None:
-    rows, peaks = stripes(27.0, 13.0)
-    found = mcp_phase(rows, peaks, 27.0)
-    assert (found.slope, found.intercept) == pytest.approx((27.0, 13.0), abs=0.01)
-    assert found.deviation_px < 0.03
-    assert found.rms_px == pytest.approx(0.05, rel=0.1)
-    assert found.outliers < 5
-    off = mcp_phase(*stripes(27.02, 12.8), 27.0)
-    assert off.deviation_px == pytest.approx(0.42, abs=0.03)
-    assert off.member == {"slope": off.slope, "intercept": off.intercept}
-
-
-def test_wrong_codes_are_left_out() -> None:
-    rows, peaks = stripes(27.0, 13.0, wrong=60)
-    found = mcp_phase(rows, peaks, 27.0)
-    assert (found.slope, found.intercept) == pytest.approx((27.0, 13.0), abs=0.02)
-    assert 55 <= found.outliers <= 70
-
-
-def test_too_few_peaks_are_refused() -> None:
-    rows, peaks = stripes(27.0, 13.0)
-    with pytest.raises(DecodeError, match="stripe peaks lie on pixels"):
-        mcp_phase(np.full_like(rows, np.nan), peaks, 27.0)
-
-
 # --- commands -------------------------------------------------------------------------------------------------------
 
 
@@ -318,35 +266,3 @@ def test_marks_are_kept_and_verified(tmp_path: Path, capsys: pytest.CaptureFixtu
     shown = capsys.readouterr().out
     assert "plate offset mm" in shown
     assert "seen" not in shown
-
-
-def test_mcp_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rows, peaks = stripes(27.0, 13.0)
-    dense = str(save(tmp_path / "pmp", None, rows=rows))
-    single = save(tmp_path / "mcp", None, rows=rows, peaks=peaks)
-    sequence = PatternSequence(ProjectorSize(1152, 864), McpPattern(axis="y"))
-    header = CaptureHeader(sequence, CameraFormat(300, 400, 8), frames=("0.png",))
-    (single / "capture").mkdir()
-    (single / "capture" / "capture.json").write_text(json.dumps(header.as_dict()))
-    lens = {"size": [300, 400], "matrix": [[500, 0, 150], [0, 500, 200], [0, 0, 1]], "distortion": [0.0] * 5}
-    old, new = tmp_path / "rig.json", tmp_path / "new.json"
-    content = {"format": "fringed-calibration", "version": 1, "camera": lens, "projector": lens}
-    old.write_text(json.dumps({**content, "rotation": np.eye(3).tolist(), "translation": [0, 100, 0]}))
-    words = ["calibrate", "mcp", dense, str(single)]
-    assert main([*words, "--calibration", str(old), "-o", str(new), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert document["ideal"] == {"slope": 27.0, "intercept": 13.0}
-    assert document["slope"] == pytest.approx(27.0, abs=0.01)
-    written = load_calibration(new)
-    assert written.extra["mcp_phase"]["slope"] == document["slope"]
-    assert written.id
-    assert main([*words, "--calibration", str(old), "-o", str(new)]) == 2
-    assert main([*words, "-o", str(new)]) == 2
-    assert main(words) == 0
-    said = capsys.readouterr()
-    assert "row = 27.0" in said.out
-    assert "differ" not in said.err
-    off = str(save(tmp_path / "off", None, rows=rows + np.float32(0.4)))
-    assert main(["calibrate", "mcp", off, str(single)]) == 0
-    assert "stripes and PMP rows differ by up to 0.40 rows" in capsys.readouterr().err
-    assert main(["calibrate", "mcp", dense, dense]) == 1

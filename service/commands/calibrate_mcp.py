@@ -1,0 +1,149 @@
+"""`fringed calibrate mcp`: MCP's stripes against PMP's rows on one flat board, with a verdict."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from scanner.digits import with_uncertainty
+from service.commands.calibrate_solve import Replace
+from service.commands.options import AsJson, output_path
+from service.terminal import print_error, print_facts, print_json
+
+if TYPE_CHECKING:
+    from scanner.calibration.mcp_phase import McpPhase
+
+
+def mcp(
+    pmp: Annotated[Path, typer.Argument(metavar="PMP-SCAN", help="A PMP scan of a matt white flat board.")],
+    single: Annotated[Path, typer.Argument(metavar="MCP-SCAN", help="An MCP scan of it, nothing moved between.")],
+    calibration: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Calibration file to which the fit is to be added.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="FILE", parser=output_path, help="With --calibration: the new file."),
+    ] = None,
+    force: Replace = False,
+    as_json: AsJson = False,
+) -> int:
+    """Check MCP's stripes against PMP's rows on one flat board: the code-to-phase fit of the dissertation.
+
+    The decoder knows the pattern, so the fit is a check: its line must be the ideal one. Scans of two scenes are
+    refused.
+
+    \b
+    Examples:
+      fringed scan --rig simulated:casey2011/board -o scans/board-pmp
+      fringed scan --rig simulated:casey2011/board --method mcp -o scans/board-mcp
+      fringed calibrate mcp scans/board-pmp scans/board-mcp
+      fringed calibrate mcp board-pmp/ board-mcp/ --calibration rig.json -o rig-mcp.json
+    """
+    if (calibration is None) != (output is None):
+        raise typer.BadParameter("--calibration FILE and -o FILE belong together")
+    if output is not None and output.exists() and not force:
+        raise typer.BadParameter(f"-o: {output} exists; --force replaces it")
+    from scanner.calibration.calibration_file import as_text  # noqa: PLC0415
+    from scanner.calibration.mcp_phase import mcp_phase  # noqa: PLC0415
+    from scanner.calibration_id import content_id  # noqa: PLC0415
+    from scanner.geometry import load_calibration  # noqa: PLC0415
+    from scanner.storage import replace_file, try_file  # noqa: PLC0415
+
+    if output is not None:
+        try_file(output)
+    rows, peaks, pitch, axis = _both(pmp, single)
+    fit = mcp_phase(rows, peaks, pitch, axis=axis)
+    if calibration is not None and output is not None:
+        content = {**load_calibration(calibration).as_dict(), "mcp_phase": fit.member}
+        content["id"] = content_id(content)
+        replace_file(output, as_text(content).encode())
+    ideal = {"slope": pitch, "intercept": pitch / 2 - 0.5}
+    if as_json:
+        verdict = {"good": fit.good, "axis": axis, "coverage_factor": 2.0}
+        print_json({**vars(fit), "ideal": ideal, "file": output and str(output), **verdict})
+    else:
+        facts = _facts(fit, pitch, "row" if axis == "y" else "column")
+        print_facts("code to phase", facts if output is None else [*facts, ("file", output)])
+    for words, hint in _troubles(fit, "rows" if axis == "y" else "columns"):
+        print_error(words, hint, label="warning")
+    return 0
+
+
+def _facts(fit: McpPhase, pitch: float, line: str) -> list[tuple[str, Any]]:
+    from scanner.calibration.mcp_phase import NOTABLE_OUTLIERS, NOTABLE_PX  # noqa: PLC0415
+
+    shown = {name: with_uncertainty(getattr(fit, name), unsure) for name, unsure in fit.expanded.items()}
+    verdict = {
+        True: "good",
+        False: "not good",
+        None: "not sure: the deviation is within what is allowed, but with its uncertainty it may not be",
+    }[fit.good]
+    allowed = f"at most {NOTABLE_PX:g} {line}s of deviation and of scatter, {NOTABLE_OUTLIERS:.0%} outliers are allowed"
+    return [
+        ("verdict", f"{verdict} ({allowed})"),
+        ("line", f"{line} = ({shown['slope']}) x stripe + ({shown['intercept']})"),
+        ("ideal", f"{line} = {pitch:.5f} x stripe + {pitch / 2 - 0.5:.4f}"),
+        ("deviation", f"{shown['deviation_px']} {line}s from the ideal line, at the stripe where it is largest"),
+        ("scatter", f"{shown['rms_px']} {line}s rms of the peaks about the line"),
+        ("peaks", f"{fit.peaks:,} on {fit.stripes} stripes; {_outliers(fit)}"),
+        ("+-", "expanded uncertainty, k = 2, by how much the stripes differ"),
+    ]
+
+
+def _outliers(fit: McpPhase) -> str:
+    wrong = f", {fit.wrong_codes:,} of them with a wrong code" if fit.wrong_codes else ""
+    return f"{fit.outliers:,} outliers left out ({fit.outlying:.1%}{wrong})"
+
+
+def _troubles(fit: McpPhase, lines: str) -> list[tuple[str, str]]:
+    """What makes the verdict other than good: words, and what to do."""
+    from scanner.calibration.mcp_phase import NOTABLE_OUTLIERS, NOTABLE_PX  # noqa: PLC0415
+
+    found = []
+    if fit.deviation_px > NOTABLE_PX:
+        found.append(
+            (
+                f"stripes and PMP {lines} differ by up to {fit.deviation_px:.2f} {lines}",
+                "correct the projector's gamma, focus it, and see that nothing moved between the scans",
+            )
+        )
+    if fit.rms_px > NOTABLE_PX:
+        found.append(
+            (
+                f"peaks scatter by {fit.rms_px:.2f} {lines} about the line, {NOTABLE_PX:g} are allowed",
+                "take a plain board, without print or gloss, and see that nothing moved between the scans",
+            )
+        )
+    if fit.outlying > NOTABLE_OUTLIERS:
+        found.append(
+            (
+                f"{fit.outlying:.0%} of the peaks are off the line and were left out, {NOTABLE_OUTLIERS:.0%} are "
+                "allowed: print, steps in depth, or something that one of the scans has and the other has not",
+                "scan a matt white flat board that fills the field, by both methods, and move nothing between",
+            )
+        )
+    return found
+
+
+def _both(pmp: Path, single: Path) -> tuple[Any, Any, float, str]:
+    """PMP's map along MCP's axis, MCP's peaks, its pitch and axis."""
+    from scanner.capture import Capture  # noqa: PLC0415
+    from scanner.errors import DecodeError  # noqa: PLC0415
+    from scanner.patterns import McpPattern  # noqa: PLC0415
+    from scanner.scan import load_scan  # noqa: PLC0415
+
+    dense, stripes = load_scan(pmp), load_scan(single)
+    sequence = Capture.open(single / "capture").header.sequence
+    if stripes.peaks is None or not isinstance(sequence.pattern, McpPattern):
+        raise DecodeError(f"{single} is no MCP scan", hint="fringed scan --method mcp")
+    axis = sequence.pattern.axis
+    rows = dense.rows if axis == "y" else dense.columns
+    if rows is None:
+        raise DecodeError(
+            f"{pmp} was not projected along axis {axis}, as {single} was", hint=f"fringed scan --axis {axis}"
+        )
+    if rows.shape != stripes.shape:
+        raise DecodeError(f"{pmp} and {single} have pictures of different sizes")
+    return rows, stripes.peaks, sequence.pattern.pitch_px(sequence.projector), axis
