@@ -24,11 +24,17 @@ STEP_RATIO = 1.5
 """Neighbouring intervals that differ by more are a step of depth, not a curved surface: a straight line then."""
 
 UNEVEN = np.float32(0.1)
-"""Share of a peak's distance from the middle between its neighbours that its error may be: what bends the surface
-bends the profile within the fit window too. Measured on a bust; a curved surface alone leaves less."""
+"""Share of the change of bend from stripe to stripe that a peak's error may be: what bends the surface otherwise than
+its neighbours do bends the profile within the fit window too, beyond what the fit follows. Measured on a bust."""
 
-BEND_LEFT = np.float32(0.25)
-"""Share of the bend between two stripes that a cubic through them leaves (the rest it follows); all of it at a step."""
+MOST_UNEVEN = np.float32(0.3)
+"""Pitches of such change that count: more is a step of depth, which bends neither side (`subpixel.MOST_BEND`)."""
+
+BEND_LEFT = np.float32(0.5)
+"""Share of the change of bend between two stripes that a cubic through them leaves: it follows an even bend."""
+
+NOISE_SIGMAS = np.float32(1.5)
+"""Of what noise may change a bend by, taken off: half as much again as peaks state (boards: 1.2 to 1.7 times)."""
 
 MARGIN = 0.42
 """Pitches added beyond the last stripe of a run: the part of its flank that the fit has seen."""
@@ -82,26 +88,29 @@ def rows_alone(knots: Knots, pitch: float, step: float, rows: Array) -> None:
 
 def _interpolate(knots: Knots, pitch: float, step: float, wide: Array) -> None:
     others = np.stack([knots.sigma, knots.confidence, knots.light, knots.height], axis=1).astype(np.float32)
-    pieces = _pieces(knots.start, knots.y, knots.row, knots.stripe, others, np.float32(pitch), wide.shape[1])
+    pieces = _pieces(
+        knots.start, knots.y, knots.row, knots.stripe, others, np.float32(pitch), np.float32(step), wide.shape[1]
+    )
     dense_lines.draw(len(knots.start) - 1, pieces, step / 3, wide)
 
 
 @kernel
 def _pieces(
-    start: Ints, y: Array, row: Array, stripe: Ints, others: Array, pitch: np.float32, size: int
+    start: Ints, y: Array, row: Array, stripe: Ints, others: Array, pitch: np.float32, step: np.float32, size: int
 ) -> tuple[Ints, Ints, Ints, Array]:
     """The columns' pieces as `dense_lines.draw` takes them: between two knots, and beyond the ends of a run."""
     count = 2 * len(y) + 1
     column, begin, end = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, np.int32)
     figures = np.empty((count, dense_lines.FIGURES), np.float32)
     tangent = np.empty(len(y), np.float32)
+    noise = others[:, 0].copy()
     n = 0
     for b in range(len(start) - 1):
         k, of_column = start[b], n
         while k < start[b + 1]:
             last = _end_of_run(y, stripe, k, start[b + 1], pitch)
             _tangents(y, row, k, last, tangent)
-            _unevenness(y, row, others, k, last)
+            _unevenness(y, row, noise, others, k, last, MOST_UNEVEN * step)
             if last > k:
                 reach = np.float32(MARGIN) * (y[k + 1] - y[k])
                 slope = tangent[0] if tangent[0] > 0 else (row[k + 1] - row[k]) / (y[k + 1] - y[k])
@@ -111,7 +120,7 @@ def _pieces(
             for j in range(k, last):
                 lines = np.ceil(y[j]), np.floor(y[j + 1]) + np.float32(1)
                 n = _place(lines, size, of_column, n, begin, end)
-                bend = _bend_of(y, row, j, k, last)
+                bend = _bend_of(y, row, noise, j, k, last)
                 _between(y, row, others, j, (tangent[j - k], tangent[j - k + 1]), bend, n - 1, figures)
             if last > k:
                 reach = np.float32(MARGIN) * (y[last] - y[last - 1])
@@ -189,31 +198,60 @@ def _tangents(y: Array, row: Array, first: int, last: int, tangent: Array) -> No
 
 
 @kernel
-def _unevenness(y: Array, row: Array, others: Array, first: int, last: int) -> None:
-    """Adds to sigma what uneven distances of the stripes say of a knot; the end of a run is as uncertain as its
+def _beyond_noise(change: np.float32, noise: Array, j: int) -> np.float32:
+    """What is left of the third difference of knots j - 1 .. j + 2 when what noise may make of it is taken off."""
+    of_noise = noise[j - 1] ** 2 + np.float32(9) * (noise[j] ** 2 + noise[j + 1] ** 2) + noise[j + 2] ** 2
+    left: np.float32 = np.sqrt(max(change * change - NOISE_SIGMAS**2 * of_noise, np.float32(0)))
+    return left
+
+
+@kernel
+def _uneven(y: Array, row: Array, noise: Array, j: int) -> np.float32:
+    """Rows by which the bend changes between knots j and j + 1, both with a neighbour beyond, more than by noise."""
+    slope = (row[j + 2] - row[j - 1]) / (y[j + 2] - y[j - 1])
+    third = y[j + 2] - y[j - 1] - np.float32(3) * (y[j + 1] - y[j])
+    return _beyond_noise(slope * third, noise, j)
+
+
+@kernel
+def _unevenness(y: Array, row: Array, noise: Array, others: Array, first: int, last: int, step: np.float32) -> None:
+    """Adds to sigma what uneven distances of the stripes say of a knot: not that they change, as they do on a surface
+    that is seen at an angle, but that they change otherwise than beside it. The end of a run is as uncertain as its
     neighbour, and twice as much by itself: an edge is near.
     """
     for j in range(first + 1, last):
+        # A knot that lies half way between its neighbours is on a straight piece, whatever comes beyond.
         slope = (row[j + 1] - row[j - 1]) / (y[j + 1] - y[j - 1])
-        off = UNEVEN * slope * (np.float32(0.5) * (y[j - 1] + y[j + 1]) - y[j])
-        others[j, 0] = np.sqrt(others[j, 0] * others[j, 0] + off * off)
+        own, change = slope * abs(y[j - 1] + y[j + 1] - np.float32(2) * y[j]), np.float32(0)
+        if j - 1 > first:
+            change = _uneven(y, row, noise, j - 1)
+        if j + 1 < last:
+            change = max(change, _uneven(y, row, noise, j))
+        if last - first == 2:  # nothing beside it says how much of its bend the surface has
+            change = own
+        off = UNEVEN * min(own, change, step)
+        others[j, 0] = np.sqrt(noise[j] ** 2 + off * off)
     if last > first + 1:
         others[first, 0] = max(np.float32(2) * others[first, 0], others[first + 1, 0])
         others[last, 0] = max(np.float32(2) * others[last, 0], others[last - 1, 0])
 
 
 @kernel
-def _bend_of(y: Array, row: Array, j: int, first: int, last: int) -> np.float32:
-    """How far rows may bend between knots j and j + 1: the larger change of slope at either, over the gap."""
+def _bend_of(y: Array, row: Array, noise: Array, j: int, first: int, last: int) -> tuple[np.float32, np.float32]:
+    """How far rows may bend between knots j and j + 1: the larger change of slope at either, over the gap; and by how
+    much these differ from one another more than by noise: at the end of a run, all of the one there is.
+    """
     gap = y[j + 1] - y[j]
     slope = (row[j + 1] - row[j]) / gap
-    change = np.float32(0)
+    before, after = np.float32(0), np.float32(0)
     if j > first:
-        change = abs(slope - (row[j] - row[j - 1]) / (y[j] - y[j - 1]))
+        before = slope - (row[j] - row[j - 1]) / (y[j] - y[j - 1])
     if j + 1 < last:
-        change = max(change, abs(slope - (row[j + 2] - row[j + 1]) / (y[j + 2] - y[j + 1])))
-    bent: np.float32 = change * gap
-    return bent
+        after = (row[j + 2] - row[j + 1]) / (y[j + 2] - y[j + 1]) - slope
+    apart = abs(after - before) * gap
+    if j > first and j + 1 < last:
+        apart = _beyond_noise(apart, noise, j)
+    return max(abs(before), abs(after)) * gap, apart
 
 
 @kernel
@@ -223,7 +261,7 @@ def _between(
     others: Array,
     j: int,
     tangents: tuple[np.float32, np.float32],
-    unknown: np.float32,
+    bend: tuple[np.float32, np.float32],
     n: int,
     figures: Array,
 ) -> None:
@@ -234,8 +272,9 @@ def _between(
     slope = rise / gap
     if left < 0 or right < 0:
         left = right = slope
+        unknown = bend[0]
     else:
-        unknown *= BEND_LEFT
+        unknown = BEND_LEFT * bend[1]
     figures[n, 0], figures[n, 1] = y[j], np.float32(1) / gap
     figures[n, 2], figures[n, 3] = row[j], rise
     figures[n, 4], figures[n, 5] = (left - slope) * gap, (right - slope) * gap
