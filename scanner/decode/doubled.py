@@ -1,143 +1,382 @@
-"""Frames of a fringe set that show what another one shows: a stale buffer, a flip that never came.
+"""Frames of a fringe set that show what they should not: a stale buffer, a late flip, two that changed places.
 
-Told from a sample of one set's pixels. Whether a capture is in step is asked with more care, and before anything else,
-by the sequencer's witnesses, which refuse it; this is for frames that come to a decoder without them. With three shifts
-nothing is left to tell a doubled frame by unless it is the same to the last bit.
+Told from a sample of pixels, set by set: an order of the frames that leaves much less than the one that was meant, and
+no more than noise would (`frame_orders`). Whether a capture is in step is asked with more care, and before anything
+else, by the sequencer's witnesses, which refuse it; this is for frames that come to a decoder without them. With three
+shifts nothing is left to tell a doubled frame by unless it is the same to the last bit, and a set that is rotated as a
+whole leaves nothing at any number.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import combinations
-from math import pi, sin
+from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.decode.frame_orders import NONE, Order, least_left, left_beside_overtones, orders_of, orders_without
 from scanner.decode.middles import nth_of
-from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel
 from scanner.decode.pmp_frames import AxisFrames
+from scanner.decode.pmp_sample import Sample
+from scanner.kernel import kernel
 
-LEAST_RESIDUAL = 0.3
-"""Of what a doubled neighbour makes of the noise that residuals tell, from where on frames are looked at: more than
-half of it may pass for overtones (.38 is left of eight shifts, .48 of sixteen). Of eight shifts that is noise of
-B / 30, of sixteen of B / 84; usual scans have B / 60, and need no look by eight."""
+LEAST_SHARE = 0.06
+"""Of what a doubled neighbour leaves where all phases are seen, from where on frames are looked at and named. Less
+than that moves phases by .1 of a radian at the most with four shifts, .04 with eight, and counts no fringe wrong."""
+
+EXPLAINED = 0.35
+"""Of what a set leaves beyond noise, at most, in an order that is believed; see `sequencer.witness_fringes`."""
+
+BEYOND, BEYOND_OWN = 0.25, 0.5
+"""Of noise's part in what a set leaves: what there must be beyond it, to be judged; and where no other set tells how
+high noise is, but the best order's own rest"""
+
+EQUALLY, EQUALLY_NOISE, EQUALLY_BEYOND = 0.02, 0.3, 3.0
+"""Orders cannot be told from the best one that leave no more beyond noise than so much of what that takes off, and of
+noise, and of what it leaves beyond noise itself: where its fit is not perfect, another one's need not be."""
 
 ALIKE = 1 / 16
 """Of two frames: mean square of their difference over that which the set's fit has there. In frames that are what they
 should be it is 1 and noise on top; noise of B / 10 hides a doubled one of eight."""
 
-ROWS, COLUMNS = 24, 64
-"""Samples of a frame: places down the image, pixels side by side at each"""
+UNEXPLAINED = 0.5
+"""Of what a doubled neighbour leaves, from where on a set that nothing explains is out of step, if others are not"""
 
-THINNED = 8
-"""Of the scan's sample, what is asked whether frames need a look: a median of five hundred is good to 6 %."""
+MOST_ALIKE = 0.5
+"""Mean vector of a set's phases, from where on it shows few of them: of phases within half a turn it is .64"""
 
+MEDIAN_SQUARE = 0.455
+"""Of a normal variable's square, over its mean"""
+
+LEAST_HEIGHT = 4.5
+"""Of fringes over noise, as seen, noise and all: lower ones give no values that could be wrong"""
+
+MOST_PIXELS = 1024
 LEAST_PIXELS = 60
+THINNED = 8
+"""Of the scan's sample, what is asked whether frames need a look: a mean of five hundred is good to 5 %."""
+
+MOST_SHIFTS = 64
+"""Of a set that is looked at: one frame of more moves a phase by a hundredth of a cycle at the most."""
+
 FEWEST_LEFT = 4
-"""Frames of a set, without a doubled one, whose residual can still tell which of two is the false one"""
+"""Frames of a set, without false ones, from where on it is decoded without them: three would fit whatever they show"""
+
+MOST_PAIRS = 3
+"""Of doubled frames in one set, of which each combination is tried"""
+
+_TRIED = 12
+_LIT2 = 1 / 16
+"""Of the brightest pixels' height, squared"""
 
 
 @dataclass(frozen=True)
-class Doubled:
-    """Two frames of a set that show the same. false, true: their numbers in the set; false is None where nothing tells
-    which of them it is, and then `true` are both."""
+class Misplaced:
+    """What is wrong with the frames of one set.
 
-    false: int | None
-    true: tuple[int, ...]
+    of_set: its number. mended: whether it is plain which frames are false, and it can be decoded without them, or with
+    two of them exchanged. orders: those that fit, and cannot be told apart; none where nothing explains what is left.
+    source: (set, frame) of another set that shows the same as the one that is false, where there is one.
+    """
+
+    of_set: int
+    mended: bool
+    orders: tuple[Order, ...]
+    source: tuple[int, int] | None = None
+
+    def says(self, position: Callable[[int, int], int]) -> str:
+        """In words. position: of (set, frame) in the sequence."""
+        if not self.orders:
+            return (
+                "its frames are no shifts of one fringe, nor are they with two of them exchanged, while those of other "
+                "frequencies are: the set is out of step"
+            )
+        told = list(dict.fromkeys(self._told(order, position) for order in self.orders))
+        involved = sorted({n for order in self.orders for n in (*order.false, order.shows[order.false[0]])})
+        if len(told) > 1 and not any(order.exchanged for order in self.orders) and len(involved) == 2:
+            told = [f"frames {' and '.join(str(position(self.of_set, n)) for n in involved)} show the same"]
+        done = ": the set is out of step"
+        if self.mended:
+            false = len(self.orders[0].false)
+            done = f", and {'was' if false == 1 else 'were'} left out"
+            if self.orders[0].exchanged:
+                done = ", and were taken in each other's place"
+        return f"{', or '.join(told)}{done}"
+
+    def mend(self, frames: dict[int, NDArray[Any]], first: int) -> None:
+        """Leave out what is false, or exchange it. frames: by fringe index, changed. first: of the set."""
+        if not self.mended:
+            return
+        (order,) = self.orders
+        taken = [frames.pop(first + n) for n in order.false]
+        if order.exchanged:
+            for n, frame in zip(order.false, reversed(taken), strict=True):
+                frames[first + n] = frame
+
+    def _told(self, order: Order, position: Callable[[int, int], int]) -> str:
+        false = [position(self.of_set, n) for n in order.false]
+        if order.exchanged:
+            return f"frames {false[0]} and {false[1]} changed places"
+        shown = [self.source if m == NONE else (self.of_set, m) for m in (order.shows[n] for n in order.false)]
+        named = [f"what frame {position(*of)} shows" if of else "nothing of its set" for of in shown]
+        return ", ".join(f"frame {n} shows {what}" for n, what in zip(false, named, strict=True))
 
 
-def may_be_doubled(
-    noise: NoiseModel, level: NDArray[np.float32], modulation: NDArray[np.float32], frames: AxisFrames
-) -> bool:
-    """Whether residuals are large enough for a look at the frames. level, modulation: (n,) of the scan's sample."""
-    shifts = [n for n in frames.shifts if n > 3]
-    if 3 in frames.shifts or not shifts:
-        return 3 in frames.shifts
-    level, modulation = level[::THINNED], modulation[::THINNED]
-    lit = modulation > 0.25 * float(modulation.max(initial=0.0))
-    level, b = level[lit], modulation[lit]
-    if not b.size:
-        return False
-    # The difference of two neighbours is 2 B sin(pi / N) times a sine; the fit takes three of N parts of it.
-    least = min(2 * sin(pi / n) ** 2 * (1 - 3 / n) for n in shifts) / frames.freedom
-    middle = float(nth_of(level, level.size // 2))
-    seen = max(noise.read + noise.per_level * middle, ROUNDING_VARIANCE) / float(nth_of(b, b.size // 2)) ** 2
-    return bool(seen > LEAST_RESIDUAL**2 * least)
+# --- whether to look ------------------------------------------------------------------------------------------------
 
 
-def doubled_frames(frames: AxisFrames, k: int, shape: tuple[int, int], clip: int) -> list[Doubled]:
-    """Of one set that has all its frames.
+def may_be_doubled(frames: AxisFrames, sample: Sample, residual: NDArray[np.float32]) -> bool:
+    """Whether the sample's residuals are large enough for a look at the frames.
 
     Args:
-        k: the set. shape: (H, W) of a frame. clip: grey level from which a sample counts as saturated.
+        sample: without what overtones are of its residuals. residual: (R, L), with it.
     """
-    alpha = frames.angles[k]
-    if len(alpha) < 3:
+    if 3 in frames.shifts:
+        return True
+    tellable = [n for n in frames.shifts if 3 < n <= MOST_SHIFTS]
+    if not tellable:
+        return False
+    least = LEAST_SHARE * min(map(least_left, tellable))
+    return _stands_out(sample.modulations, sample.usable, residual, sample.residual, sample.phases, least, THINNED)
+
+
+@kernel
+def _stands_out(
+    modulations: NDArray[np.float32],
+    usable: NDArray[np.bool_],
+    residual: NDArray[np.float32],
+    without: NDArray[np.float32],
+    phases: NDArray[np.float32],
+    least: float,
+    every: int,
+) -> bool:
+    """Whether residuals are more than `least` of B^2: what overtones explain of them counts where a set shows so few
+    phases that one of its frames out of step would look like them."""
+    sets, length = modulations.shape[0], modulations.shape[2]
+    height2 = np.zeros((modulations.shape[1] + every - 1) // every * length, np.float32)
+    for r in range(0, modulations.shape[1], every):
+        for i in range(length):
+            if usable[r, i]:
+                for k in range(sets):
+                    b = modulations[k, r, i]
+                    height2[r // every * length + i] = max(height2[r // every * length + i], b * b)
+    lit = np.float32(_LIT2) * nth_of(height2, int(0.99 * (height2.size - 1)))
+    total, all_left, left = 0.0, 0.0, 0.0
+    for r in range(0, modulations.shape[1], every):
+        for i in range(length):
+            here = height2[r // every * length + i]
+            if here > lit:
+                total += here
+                all_left += residual[r, i]
+                left += without[r, i]
+    if all_left <= least * total:
+        return False
+    return left > least * total or _shows_few_phases(phases, height2, lit, every)
+
+
+@kernel
+def _shows_few_phases(phases: NDArray[np.float32], height2: NDArray[np.float32], lit: np.float32, every: int) -> bool:
+    """Whether one of the sets shows most of its lit pixels within a third of a turn or so."""
+    length = phases.shape[2]
+    for k in range(phases.shape[0]):
+        cosine, sine, count = 0.0, 0.0, 0
+        for r in range(0, phases.shape[1], every):
+            for i in range(length):
+                if height2[r // every * length + i] > lit:
+                    cosine += np.cos(2 * np.pi * phases[k, r, i])
+                    sine += np.sin(2 * np.pi * phases[k, r, i])
+                    count += 1
+        if cosine * cosine + sine * sine > (MOST_ALIKE * count) ** 2:
+            return True
+    return False
+
+
+# --- the look -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """All frames of an axis at p lit pixels.
+
+    samples: by set, (N, p) float64. products: by set, (N, N) their means. heights2: by set, mean B^2, of all that
+    changes from frame to frame, whatever the order.
+    """
+
+    samples: tuple[NDArray[np.float64], ...]
+    products: tuple[NDArray[np.float64], ...]
+    heights2: tuple[float, ...]
+
+
+def misplaced_frames(frames: AxisFrames, sample: Sample) -> list[Misplaced]:
+    """What is wrong with the sets that have all their frames."""
+    at = _lit_pixels(sample, frames)
+    if at.size < LEAST_PIXELS:
         return []
-    if len(alpha) == 3 and _all_differ(frames, k):
+    seen = _read(frames, at)
+    verdicts = {k: _Verdict(k, seen) for k, n in enumerate(frames.shifts) if 3 < n <= MOST_SHIFTS}
+    found: list[Misplaced] = []
+    for k, shifts in enumerate(frames.shifts):
+        if shifts == 3:
+            found += _one_picture(k, seen)
+        elif k in verdicts:
+            found += verdicts[k].found(min((v.noise for j, v in verdicts.items() if j != k), default=None))
+    return found
+
+
+def _lit_pixels(sample: Sample, frames: AxisFrames) -> NDArray[np.intp]:
+    """(p,) indices of pixels of the sample, MOST_PIXELS at the most."""
+    counts = np.array([max(len(have), 1) for have in frames.there], np.float32) / 2
+    power = np.tensordot(counts, sample.modulations**2, 1) + sample.residual
+    power[~sample.usable] = 0
+    top = np.partition(power.reshape(-1), int(0.99 * (power.size - 1)))[int(0.99 * (power.size - 1))]
+    at = (sample.runs[:, None] + np.arange(power.shape[1]))[power > _LIT2 * top]
+    return np.asarray(at[:: max(-(-at.size // MOST_PIXELS), 1)])
+
+
+def _read(frames: AxisFrames, at: NDArray[np.intp]) -> _Seen:
+    samples, products, heights2 = [], [], []
+    for first, count in zip(frames.starts.tolist(), frames.shifts, strict=False):
+        taken = [frames.frames[first + n].reshape(-1)[at] for n in range(count if count <= MOST_SHIFTS else 0)]
+        # Whole levels: sums of their products are exact, so that what is the same differs by nothing.
+        grey = np.stack(taken).astype(np.float64) if taken else np.zeros((0, at.size))
+        samples.append(grey)
+        products.append(grey @ grey.T / at.size)
+        heights2.append(2 * float(grey.var(axis=0).mean()) if taken else 0.0)
+    return _Seen(tuple(samples), tuple(products), tuple(heights2))
+
+
+def _one_picture(k: int, seen: _Seen) -> list[Misplaced]:
+    """Of a set of three: two frames that are the same to the last bit."""
+    pairs = [(n, m) for n, m in combinations(range(3), 2) if np.array_equal(seen.samples[k][n], seen.samples[k][m])]
+    if not pairs:
         return []
-    samples = _samples(frames, k, shape, clip)
-    if samples.shape[1] < LEAST_PIXELS:
+    n, m = pairs[0]
+    return [Misplaced(k, False, (Order.of(3, {n: m}), Order.of(3, {m: n})))]
+
+
+class _Verdict:
+    """On one set of four shifts or more. noise: variance of a sample, if one of its orders is true."""
+
+    def __init__(self, k: int, seen: _Seen) -> None:
+        self._k, self._seen, self._samples = k, seen, seen.samples[k]
+        self._shifts = len(self._samples)
+        self._freedom = self._shifts - 3
+        self._least = least_left(self._shifts) * seen.heights2[k]
+        known = orders_of(self._shifts)
+        self._left = known.left(seen.products[k])
+        self._before = left_beside_overtones(self._samples, known.orders[0])
+        best = left_beside_overtones(self._samples, known.orders[int(np.argmin(self._left))])
+        self.noise = min(self._before, best) / self._freedom
+        if self._shifts > 4:
+            without = orders_without(self._shifts)
+            least = int(np.argmin(without.left(seen.products[k])))
+            self.noise = min(
+                self.noise, left_beside_overtones(self._samples, without.orders[least]) / (self._freedom - 1)
+            )
+        self._noise: float | None = None
+
+    def found(self, noise: float | None) -> list[Misplaced]:
+        """One fault at the most, but any number of doubled frames.
+
+        Args:
+            noise: variance of a sample by other sets; None where no other set tells.
+        """
+        self._noise, before = noise, self._before
+        if self._seen.heights2[self._k] < LEAST_HEIGHT**2 * min(self.noise, noise or np.inf):
+            return []
+        if noise is not None and not self._stands_out(before, noise, BEYOND):
+            return []
+        orders, source = self._explaining(before) or self._several_alike(before), None
+        if not orders:
+            orders, source = self._foreign(before)
+        if orders:
+            return [Misplaced(self._k, self._plain(orders), orders, source)]
+        if noise is not None and min(before, self._typical()) - self._freedom * noise > UNEXPLAINED * self._least:
+            return [Misplaced(self._k, False, ())]
         return []
-    count = len(alpha)
-    # Sums of products of all frames tell the differences of each two, and those of the fringe that fits them best.
-    sums = (samples @ samples.T) / samples.shape[1]
-    apart = _differences(sums)
-    if count == 3:
-        meant = np.where(apart == 0, np.diag(sums).mean(), 0.0)
-    else:
-        fit = _fit(alpha, np.arange(count))
-        meant = _differences(fit @ sums @ fit.T)
-    pairs = [(n, m) for n, m in combinations(range(count), 2) if apart[n, m] < ALIKE * meant[n, m]]
-    return [_which(alpha, samples, pair) for pair in pairs]
+
+    def _typical(self) -> float:
+        """What most pixels have left, as a mean would have it: of what moves, some have much.
+
+        Of something that owes nothing to the fringe, rests are normal at four shifts, where their square's median is
+        furthest from its mean.
+        """
+        rest = orders_of(self._shifts).rests[0].reshape(self._shifts, -1) @ self._samples
+        return float(np.median(np.sum(rest**2, axis=0))) / MEDIAN_SQUARE
+
+    def _stands_out(self, before: float, noise: float, share: float) -> bool:
+        """Whether a set leaves more than noise makes of it."""
+        expected = self._freedom * noise
+        return before - expected > max(LEAST_SHARE * self._least, share * expected)
+
+    def _explaining(self, before: float) -> tuple[Order, ...]:
+        """Orders that do, as well as each other; of frames of the set."""
+        known = orders_of(self._shifts)
+        enough = np.flatnonzero(self._left < self._left[0] - LEAST_SHARE * self._least)
+        tried = enough[np.argsort(self._left[enough], kind="stable")][:_TRIED]
+        left = {int(h): left_beside_overtones(self._samples, known.orders[h]) for h in tried}
+        return self._best(before, [(known.orders[h], after) for h, after in left.items()], self._freedom)
+
+    def _foreign(self, before: float) -> tuple[tuple[Order, ...], tuple[int, int] | None]:
+        """Orders with one frame that shows nothing of its set, and what of another set it shows."""
+        orders: tuple[Order, ...] = ()
+        if self._shifts > 4:
+            known = orders_without(self._shifts)
+            left = [(order, left_beside_overtones(self._samples, order)) for order in known.orders]
+            orders = self._best(before, left, self._freedom - 1)
+        like = {n: source for n in range(self._shifts) if (source := self._like(n)) is not None}
+        if not orders and len(like) == 1:
+            orders = tuple(Order.of(self._shifts, {n: NONE}) for n in like)
+        return orders, like.get(orders[0].false[0]) if len(orders) == 1 else None
+
+    def _best(self, before: float, left: list[tuple[Order, float]], freedom: int) -> tuple[Order, ...]:
+        """Those that leave next to nothing, where `before` is left of the order that was meant."""
+        if not left:
+            return ()
+        least = min(after for _, after in left)
+        noise, share = (least / freedom, BEYOND_OWN) if self._noise is None else (self._noise, BEYOND)
+        beyond = before - self._freedom * noise, least - freedom * noise
+        if before - least < LEAST_SHARE * self._least or beyond[1] > EXPLAINED * beyond[0]:
+            return ()
+        if not self._stands_out(before, noise, share):
+            return ()
+        equal = EQUALLY * (before - least) + EQUALLY_NOISE * freedom * noise + EQUALLY_BEYOND * max(beyond[1], 0.0)
+        return tuple(order for order, after in left if after == least or after - freedom * noise < equal)
+
+    def _several_alike(self, before: float) -> tuple[Order, ...]:
+        """Orders with each of two frames that show the same in place of the other, two such pairs or three."""
+        fit = np.eye(self._shifts) - orders_of(self._shifts).rests[0].reshape(self._shifts, -1)
+        products = self._seen.products[self._k]
+        apart, meant = _differences(products), _differences(fit @ products @ fit.T)
+        pairs = [(n, m) for n, m in combinations(range(self._shifts), 2) if apart[n, m] < ALIKE * meant[n, m]]
+        if not 1 < len(pairs) <= MOST_PAIRS:
+            return ()
+        ways = product(*(((n, m), (m, n)) for n, m in pairs))
+        orders = [Order.of(self._shifts, dict(way)) for way in ways]
+        return self._best(before, [(o, left_beside_overtones(self._samples, o)) for o in orders], self._freedom)
+
+    def _like(self, n: int) -> tuple[int, int] | None:
+        """(set, frame) of another set that shows what frame n of this one does: differing fringes are B^2 apart."""
+        own = self._samples[n]
+        apart = [
+            (float(np.mean((frame - own) ** 2)), (j, m))
+            for j, samples in enumerate(self._seen.samples)
+            for m, frame in enumerate(samples)
+            if j != self._k
+        ]
+        least, where = min(apart, default=(np.inf, (0, 0)))
+        return where if least < ALIKE * self._seen.heights2[self._k] else None
+
+    def _plain(self, orders: tuple[Order, ...]) -> bool:
+        """Whether it is plain which frames are false, and enough are left."""
+        one = orders[0]
+        return len(orders) == 1 and (one.exchanged or self._shifts - len(one.false) >= FEWEST_LEFT)
 
 
-def _all_differ(frames: AxisFrames, k: int) -> bool:
-    """Whether no two frames of a set are the same picture: a look at a few pixels in the middle, and seldom more."""
-    first, count = int(frames.starts[k]), len(frames.angles[k])
-    few = [frame.reshape(-1) for frame in frames.frames[first : first + count]]
-    middle = few[0].size // 2
-    pictures = {frame[middle : middle + COLUMNS].tobytes() for frame in few}
-    return len(pictures) == count
-
-
-def _differences(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+def _differences(products: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, N) mean squares of the differences of each two, from the means of their products."""
-    own = np.diag(sums)
-    return np.asarray(np.maximum(own[:, None] + own - 2 * sums, 0.0))
-
-
-def _samples(frames: AxisFrames, k: int, shape: tuple[int, int], clip: int) -> NDArray[np.float64]:
-    """(N, p) grey levels of lit pixels that do not saturate."""
-    height, width = shape
-    first = int(frames.starts[k])
-    # Pixels side by side, elsewhere in each row: fringes of either axis show all their phases.
-    rows = (np.arange(ROWS) + 0.5) * height / ROWS
-    columns = (np.arange(ROWS) * 7 % ROWS) * max(width - COLUMNS, 0) / (ROWS - 1)
-    at = (rows.astype(np.intp) * width + columns.astype(np.intp))[:, None] + np.arange(min(COLUMNS, width))
-    taken = [frames.frames[first + n].reshape(-1)[at.reshape(-1)] for n in range(len(frames.angles[k]))]
-    grey = np.stack(taken)
-    most, least = grey.max(axis=0), grey.min(axis=0)
-    spread = most - least
-    # Whole levels: sums of their products are exact, so that what is the same differs by nothing.
-    return np.asarray(grey[:, (spread > 0.25 * spread.max(initial=0)) & (most < clip)].astype(np.float64))
-
-
-def _which(alpha: NDArray[np.float64], samples: NDArray[np.float64], pair: tuple[int, int]) -> Doubled:
-    """The one without which the others fit best, where enough are left."""
-    if len(alpha) - 1 < FEWEST_LEFT:
-        return Doubled(None, pair)
-    left = []
-    for n in pair:
-        others = np.flatnonzero(np.arange(len(alpha)) != n)
-        left.append(float(np.mean((samples[others] - _fit(alpha, others) @ samples[others]) ** 2)))
-    false, true = pair if left[0] < left[1] else pair[::-1]
-    return Doubled(false, (true,))
-
-
-def _fit(alpha: NDArray[np.float64], which: NDArray[np.intp]) -> NDArray[np.float64]:
-    """(n, n) what takes the samples of some shifts to those of the fringe that fits them best."""
-    turns = alpha[which]
-    design = np.stack([np.ones_like(turns), np.cos(turns), np.sin(turns)], axis=1)
-    return np.asarray(design @ np.linalg.pinv(design))
+    own = np.diag(products)
+    return np.asarray(np.maximum(own[:, None] + own - 2 * products, 0.0))

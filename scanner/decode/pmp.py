@@ -29,11 +29,11 @@ from scanner.decode import (
     spectra,
 )
 from scanner.decode.agreement import disagreements, doubtful_counts
-from scanner.decode.doubled import doubled_frames
+from scanner.decode.doubled import Misplaced, misplaced_frames
 from scanner.decode.field_end import FieldEnd, heights_of, mind_ends
 from scanner.decode.frames import FrameCheck
 from scanner.decode.lone_set import require_fringes
-from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps
+from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps, undecided
 from scanner.decode.pmp_frames import axis_frames
 from scanner.decode.pmp_plan import plan_axis, whole_sets
 from scanner.decode.strips import threads_to_use
@@ -185,28 +185,25 @@ class PmpDecoder:
         self._found[axis] = self._decoded_in_step(axis, brief=False)
 
     def _decoded_in_step(self, axis: Axis, brief: bool) -> AxisFound:
-        """Decode one axis, without the frames of it that are found to show what others show."""
+        """Decode one axis, without the frames of it that are found to show what they should not."""
         found = self._decoded_axis(axis, brief)
-        return self._decoded_axis(axis, brief) if self._without_doubled(axis, found) else found
+        faults = self._misplaced(axis, found)
+        if all(fault.mended for fault in faults):
+            return self._decoded_axis(axis, brief) if faults else found
+        self._ends[axis] = None
+        return undecided(found)
 
-    def _without_doubled(self, axis: Axis, found: AxisFound) -> bool:
-        """Leave doubled frames out, and keep what is to be said of them; whether any was left out."""
+    def _misplaced(self, axis: Axis, found: AxisFound) -> list[Misplaced]:
+        """What is wrong with an axis's frames: mended where it can be, and kept to be told."""
         if not found.may_be_doubled:
-            return False
-        frames, clip = axis_frames(self._pattern, axis, self._frames), self._thresholds.clip(self._camera)
-        before = len(self._frames)
-        for k, s in enumerate(s for s in self._pattern.sets() if s.axis == axis):
-            for one in doubled_frames(frames, k, self._camera.shape, clip):
-                positions = [self._sequence.fringes[s.first + n] for n in one.true]
-                told = f"frequency {s.frequency:g} along {axis}: "
-                if one.false is None:
-                    told += f"frames {' and '.join(map(str, positions))} show the same: the set is out of step"
-                else:
-                    false = self._sequence.fringes[s.first + one.false]
-                    told += f"frame {false} shows what frame {positions[0]} shows, and was left out"
-                    self._frames.pop(s.first + one.false, None)
-                self._doubled.append(f"{told}; capture again")
-        return len(self._frames) < before
+            return []
+        sets = [s for s in self._pattern.sets() if s.axis == axis]
+        faults = misplaced_frames(axis_frames(self._pattern, axis, self._frames), found.sample)
+        for fault in faults:
+            told = fault.says(lambda k, n: self._sequence.fringes[sets[k].first + n])
+            self._doubled.append(f"frequency {sets[fault.of_set].frequency:g} along {axis}: {told}; capture again")
+            fault.mend(self._frames, sets[fault.of_set].first)
+        return faults
 
     def _decoded_axis(self, axis: Axis, brief: bool) -> AxisFound:
         frames = axis_frames(self._pattern, axis, self._frames)

@@ -7,7 +7,7 @@ kernels leave the interpreter lock alone. Both axes of a scan are decoded apart 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -212,6 +212,7 @@ def decode_axis(
     )  # fmt: skip
     with Shared(lambda gate, counts: decode_strips(*arguments, gate, counts), threads, REASONS) as shared:
         sample, seen = take_sample(frames, plan, pixels, camera.max_value, clip, modulation_limits)
+        residual = sample.residual
         sample, least = honest(sample, seen, frames, plan), seen.least
         judged = sample.judged(plan, least, sigmas, t.phase_floor_cycles)
         noise = judged.noise
@@ -224,6 +225,7 @@ def decode_axis(
         shared.open()
         # What a report tells is no business of the pass: others are in it by now.
         found = remainders(plan.ladder, judged.steps, judged.pixels)
+        doubled = may_be_doubled(frames, sample, residual)
         random_px, ripple, light = np.nan, None, Light((), None)
         if not brief:
             random_px = plan.per_cycle * judged.phase_sigma(finest)
@@ -259,9 +261,21 @@ def decode_axis(
             counts += changes
     return AxisFound(
         maps, plan.ladder, noise, found, settled, off_surface, ripple, light, random_px, counts,
-        may_be_doubled(noise, sample.mean.reshape(-1), sample.modulations[finest].reshape(-1), frames),
-        sample, rooms,
+        doubled, sample, rooms,
     )  # fmt: skip
+
+
+def undecided(found: AxisFound) -> AxisFound:
+    """The same of an axis whose frames were out of step: no pixel with light has a value, and nothing is told of what
+    its frequencies and its light would have been."""
+    maps, counts = found.maps, np.zeros(REASONS, np.int64)
+    there = np.isin(maps.reason, (Reason.VALUE, Reason.UNWRAP_RISK, Reason.BORDER, Reason.MOVED))
+    maps.reason[there] = Reason.OUT_OF_STEP
+    for values in (maps.position, maps.sigma):
+        values.fill(np.nan)
+    maps.confidence.fill(0)
+    counts += np.bincount(maps.reason, minlength=REASONS)
+    return replace(found, remainders=[], settled=0, off_surface=0, ripple=None, light=Light((), None), counts=counts)
 
 
 def _ripple(last: Remainder, weight: float, per_cycle: float, random_px: float) -> Ripple:

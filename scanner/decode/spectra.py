@@ -101,7 +101,7 @@ def _ratio(sums: NDArray[np.float64], folded: bool) -> complex:
         return complex(sums[REAL] / power, sums[IMAGINARY] / power)
     aa, ab, bb = sums[AA], sums[AB], sums[BB]
     determinant = aa * bb - ab * ab
-    if determinant < 1e-9 * aa * bb:
+    if determinant <= 1e-9 * aa * bb:
         return complex(0.0, 0.0)
     real, imaginary = bb * sums[REAL] - ab * sums[IMAGINARY], aa * sums[IMAGINARY] - ab * sums[REAL]
     return complex(real / determinant, imaginary / determinant)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scanner.decode import decoder_for
+from scanner.decode import Reason, decoder_for
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
 
 SIZE = ProjectorSize(128, 400)
@@ -60,6 +60,91 @@ def test_coordinates_alone_are_those_of_the_whole_answer(shifts):
     assert brief.warnings[0] == whole.warnings[0]
     np.testing.assert_array_equal(brief.rows, whole.rows)
     np.testing.assert_array_equal(brief.confidence, whole.confidence)
+
+
+def shown(frames, first, faults):
+    """The same with frames of a set in place of others of it."""
+    taken = list(frames)
+    for n, m in faults.items():
+        taken[first + n] = frames[first + m]
+    return taken
+
+
+@pytest.mark.parametrize("shifts", [7, 8, 16])
+@pytest.mark.parametrize("k", [0, 2])
+@pytest.mark.parametrize("apart", [1, 2])
+def test_two_frames_that_changed_places_are_named_and_taken_in_each_others_place(shifts, k, apart):
+    sequence, frames, _ = captured(shifts)
+    one, two = k * shifts + 2, k * shifts + 2 + apart
+    found = decoded(sequence, shown(frames, k * shifts, {2: 2 + apart, 2 + apart: 2}))
+    told = f"frames {one} and {two} changed places, and were taken in each other's place; capture again"
+    assert found.warnings == (f"frequency {(1, 4, 16)[k]} along y: {told}",)
+    np.testing.assert_array_equal(found.rows, decoded(sequence, frames).rows)
+
+
+@pytest.mark.parametrize("k", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("faults", "told"),
+    [
+        ({1: 0}, "frames {0} and {1} show the same"),
+        ({0: 3}, "frames {0} and {3} show the same"),
+        ({3: 1}, "frames {1} and {3} show the same"),
+        ({1: 2, 2: 1}, "frames {1} and {2} changed places, or frames {0} and {3} changed places"),
+        ({0: 1, 1: 0}, "frames {0} and {1} changed places, or frames {2} and {3} changed places"),
+        ({0: -1}, "frame {0} shows what frame {before} shows"),
+    ],
+    ids=str,
+)
+def test_of_four_shifts_no_value_is_left_and_the_frames_are_named(k, faults, told):
+    """Each fault leaves the same residual as another one: what can be told apart is named, and nothing is guessed."""
+    if -1 in faults.values() and k == 0:
+        return
+    sequence, frames, _ = captured(4)
+    first = 4 * k
+    found = decoded(sequence, shown(frames, first, faults))
+    told = told.format(*range(first, first + 4), before=first - 1)
+    assert len(found.warnings) == 1
+    words = found.warnings[0]
+    assert words.startswith(f"frequency {(1, 4, 16)[k]} along y: ")
+    assert words.endswith(": the set is out of step; capture again")
+    assert sorted(told.split(", or ")) == sorted(words[: words.index(": the set")].split("along y: ")[1].split(", or "))
+    assert not np.isfinite(found.rows).any()
+    assert not found.confidence.any()
+    assert set(np.unique(found.reason)) <= {Reason.OUT_OF_STEP, Reason.SHADOW, Reason.LOW_MODULATION}
+    assert sum(found.details["counts"].values()) == found.reason.size
+
+
+@pytest.mark.parametrize("shifts", [5, 8])
+def test_a_set_that_begins_with_the_last_frame_of_the_one_before_is_decoded_without_it(shifts):
+    sequence, frames, rows = captured(shifts)
+    frames[shifts] = frames[shifts - 1]
+    found = decoded(sequence, frames)
+    told = f"frame {shifts} shows what frame {shifts - 1} shows, and was left out; capture again"
+    assert found.warnings == (f"frequency 4 along y: {told}",)
+    assert np.nanmean(np.abs(found.rows - rows)[:, 2:-2] < 2 * found.sigma_rows[:, 2:-2]) > 0.92
+
+
+def test_two_doubled_frames_of_one_set_are_both_left_out():
+    sequence, frames, rows = captured(8)
+    found = decoded(sequence, shown(frames, 16, {2: 1, 6: 5}))
+    told = "frame 18 shows what frame 17 shows, frame 22 shows what frame 21 shows, and were left out"
+    assert found.warnings[0] == f"frequency 16 along y: {told}; capture again"
+    assert np.nanmedian(np.abs(found.rows - rows)) < 0.2
+
+
+@pytest.mark.parametrize("kind", ["flicker", "response", "moves"])
+def test_what_else_leaves_residuals_is_not_taken_for_frames_out_of_step(kind):
+    generator = np.random.default_rng(5)
+    for shifts in (4, 5, 8):
+        sequence, frames, _ = captured(shifts)
+        if kind == "flicker":
+            frames = [np.rint(np.minimum(frame * (1 + generator.normal(0, 0.05)), 255)) for frame in frames]
+        elif kind == "response":
+            frames = [np.rint(255 * (frame / 255) ** 2.2) for frame in frames]
+        else:
+            frames = [np.where(np.arange(CAMERA.width) < n, 200 - frame, frame) for n, frame in enumerate(frames)]
+        found = decoded(sequence, [frame.astype(np.uint8) for frame in frames])
+        assert not [words for words in found.warnings if "capture again" in words]
 
 
 def test_of_four_shifts_both_are_named_and_of_three_those_that_are_one_picture():
