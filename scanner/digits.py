@@ -25,10 +25,14 @@ def rounded(value: float, places: int = UNKNOWN_PLACES) -> str:
     return f"{round(value, places) if places < 0 else value:z.{max(places, 0)}f}"
 
 
-def with_uncertainty(value: float, expanded: float | None) -> str:
-    """`1345.98 +- 0.53`. expanded: U, k = 2, in the value's unit; None: unknown."""
+def with_uncertainty(value: float, expanded: float | None, known: float | None = None) -> str:
+    """`1345.98 +- 0.53`. expanded: U, k = 2, in the value's unit; None: unknown.
+
+    known: of an unknown U the part that is known, k = 2: the value has no digits that this alone makes worthless.
+    """
     if expanded is None or not math.isfinite(expanded):
-        return f"{rounded(value)} +- unknown"
+        places = UNKNOWN_PLACES if known is None else min(places_of(known), UNKNOWN_PLACES)
+        return f"{rounded(value, places)} +- unknown"
     return f"{rounded(value, places_of(expanded))} +- {alone(expanded)}"
 
 

@@ -41,10 +41,15 @@ from scanner.geometry import Calibration, load_calibration
 from scanner.scan import Scan
 from scanner.stated_length import stated_length_of
 
+SIMULATED = "simulated-"
+"""Begins the ids of calibrations that are the true ones of simulated rigs; one that is changed gets its hash"""
 SAME_PX = 0.05
 """Projector px by which points may miss their coordinates under the scan's own calibration: float32 leaves a
 thousandth. Points of both axes lie between the two: noise, as it is stated, comes on top."""
 
+FEW_USED = 0.9
+"""Share of a scan's points that features explain, below which a board's figures may be of a part of it: of a plain
+board that fills the scan it is 99.9 %"""
 NOISE_OF = {"flatness_mm": "noise_mm", "form_mm": "noise_mm", "shell_mm": "shell_noise_mm"}
 """What a figure is called that noise alone would make of a perfect feature"""
 
@@ -91,6 +96,7 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
         found["length"]["uncertainty"] = {"error_mm": of_length, "measured_mm": of_length}
     if found:
         found["coverage_factor"], found["unknown"] = COVERAGE_FACTOR, why
+        found["warnings"] = _warnings(found)
         found["stated_length"] = None if rig is None or why is not None else _of_stated(found, rig)
     if wanted.edge is not None:
         x, y, width, height = wanted.edge
@@ -98,6 +104,18 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
     if wanted.marks is not None:
         found["marks"] = measured_marks(wanted.marks, scan.albedo, scan.xyz)
     return found
+
+
+def _warnings(found: dict[str, Any]) -> list[str]:
+    """What the figures do not say of themselves."""
+    used = sum(found[kind]["used"] for kind in ("flat", "sphere") if kind in found)
+    if "flat" not in found or used >= FEW_USED:
+        return []
+    return [
+        f"the board's figures are of {found['flat']['used']:.0%} of the scan's points: the others lie off its plane by "
+        "more than eight times the usual. Is all of it one board? Keep what is not out of the scan (fringed decode "
+        "--box or --depth), or it is bent or broken by more than these figures say"
+    ]
 
 
 def rig_of(folder: Path, scan: Scan, given: Path | None = None) -> tuple[Rig | None, str | None]:
@@ -114,7 +132,8 @@ def rig_of(folder: Path, scan: Scan, given: Path | None = None) -> tuple[Rig | N
     if not _made_by(rig, scan):
         return None, f"the scan's points were not made by calibration {calibration.id or given}"
     if calibration.extra.get("covariance") is None:
-        return rig, "the calibration has no covariance"
+        simulated = calibration.id.startswith(SIMULATED)
+        return rig, f"the calibration has no covariance{' (the true one of a simulated rig)' if simulated else ''}"
     return rig, None
 
 

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from scanner.calibration import figure_spread
+from scanner.calibration.one_scene import Repeat, require_one_scene
 from scanner.calibration.targets import parse_target
 from scanner.calibration.verification import flat_board, local_point, repeatability, sphere, target_length
+from scanner.calibration.verified import Wanted, verified
+from scanner.capture import CaptureHeader
 from scanner.errors import DecodeError
-from scanner.scan import Scan
+from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
+from scanner.scan import Scan, load_scan
 from service.cli import main
+from service.commands.verify_words import errors_of, show, warnings_in
 from tests.unit.test_calibration_marks import PLACES, field
 
 HEIGHT, WIDTH = 120, 160
@@ -151,6 +158,71 @@ def test_length_between_the_ends_of_a_row() -> None:
         target_length(albedo, xyz, target)
 
 
+def test_scans_that_do_not_repeat_each_other_are_told_apart() -> None:
+    """By noise alone nothing is said; a twentieth of a millimetre, three times the noise, is; a hundredth of the
+    distance is another scene, and its scan is named."""
+    sigma = np.full((HEIGHT, WIDTH), 0.02, np.float32)
+    scans = [Repeat(f"s{k}", board(0.02, seed=k), sigma) for k in range(3)]
+    assert require_one_scene(scans) == []
+    moved = replace(scans[2], xyz=scans[2].xyz + np.array([0, 0, 0.2]))
+    (said,) = require_one_scene([*scans[:2], moved])
+    assert said.startswith("s2 differs from the others by more than noise: 80%")
+    assert require_one_scene([*scans[:2], replace(moved, sigma_z=None)]) == [], "without sigmas nothing tells"
+    corner = scans[1].xyz.copy()
+    corner[:40, :60, 2] += 20.0
+    with pytest.raises(DecodeError, match=r"s1 shows another scene than s0, .*: 12% of the pixels"):
+        require_one_scene([scans[0], replace(scans[1], xyz=corner)])
+    with pytest.raises(DecodeError, match=r"s1 shows another scene than the others"):
+        require_one_scene([scans[0], replace(scans[1], xyz=corner), scans[2]])
+
+
+def of_a_board(**more: Any) -> dict[str, Any]:
+    """Of one board, as `verify` writes it: of the figures' U nothing but the points' part is known."""
+    figures = {"flatness_mm": 0.39004, "rms_mm": 0.06391, "distance_mm": 1346.00011, "used": 0.52, "noise_mm": 0.3}
+    names = ("flatness_mm", "rms_mm", "distance_mm")
+    spreads = {name: {"random": 0.002, "calibration": None, "expanded": None} for name in names}
+    one = {
+        "scan": "b1",
+        "flat": {**figures, "uncertainty": spreads},
+        "coverage_factor": 2.0,
+        "unknown": "no covariance",
+        "systematic_besides": {"mm": 0.0, "calibration": True, "unknown": ["calibration", "response"]},
+    }
+    return {"scans": [{**one, **more}]}
+
+
+def test_what_is_unknown_is_no_zero_and_has_no_digits(capsys: pytest.CaptureFixture[str]) -> None:
+    found = of_a_board()
+    worst = max(errors_of(found), key=lambda error: error.mm)
+    show(found, worst)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "systematic unknown (calibration, response); in none of these figures: b1" in said
+    assert "0.390 +- unknown 0.064 +- unknown 1346.000 +- unknown 0.5200 0.300" in said
+    assert "has 0.300 by noise, beyond it 0.249 +- unknown: b1" in said
+    assert "largest error 0.390 +- unknown mm, the flatness of b1, as measured" in said
+    besides = {"mm": 0.0163, "calibration": True, "unknown": ["calibration"]}
+    show(of_a_board(systematic_besides=besides), worst)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "systematic at least +-0.033 mm of depth (k = 2), and what is unknown (calibration); in none of" in said
+    known = of_a_board()
+    known["scans"][0]["flat"]["uncertainty"]["flatness_mm"]["expanded"] = 0.02
+    show(known, worst)
+    assert (
+        "0.390 +- 0.020 mm, VDI/VDE 2634-2, 99.7 % of the points; a perfect board has 0.300 by noise, beyond it "
+        in (shown := " ".join(capsys.readouterr().out.split()))
+    )
+    assert "beyond it 0.249 +- 0.031: b1" in shown, "of 0.39 +- 0.02 in quadrature"
+
+
+def test_a_board_of_half_a_scans_points_is_warned_of(tmp_path: Path) -> None:
+    spoilt = board(0.02)
+    spoilt[60:, :, 2] += 25.0
+    spoilt[:3, :, 2] = np.nan
+    folder = save(tmp_path / "b1", spoilt)
+    (said,) = warnings_in({"scans": [{"scan": "b1", **verified(folder, load_scan(folder), Wanted(flat=True))}]})
+    assert said.startswith("b1: the board's figures are of 51% of the scan's points")
+
+
 # --- commands -------------------------------------------------------------------------------------------------------
 
 
@@ -194,6 +266,8 @@ def test_verify_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     assert "+- unknown: standard deviation of 2 scans (k = 2)" in said
     assert "from three scans on" in said
     assert document["largest_error_mm"] == pytest.approx(0.119, rel=0.1)
+    assert document["largest_error_of"].startswith(f"the flatness of {tmp_path / 'b'}")
+    assert (repeats["warnings"], document["scans"][0]["warnings"]) == ([], [])
     assert main(["calibrate", "verify", boards[0], "--flat", "--tolerance", "0.05"]) == 1
     shown = capsys.readouterr()
     assert "0.05 mm are allowed" in shown.err
@@ -201,10 +275,28 @@ def test_verify_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     for words in ([], ["--length", "3"], ["--repeat"]):
         assert main(["calibrate", "verify", boards[0], *words]) == 2
     copy = str(save(tmp_path / "copy", board(0.02, seed=0)))
-    for again, words in ((boards[0] + "/../b0", "is given twice"), (copy, "is a copy of")):
+    anew = save(tmp_path / "anew", board(0.02, seed=0))
+    for folder, told in ((anew, "two"), (tmp_path / "b0", "one")):
+        header = CaptureHeader(PatternSequence(ProjectorSize(1152, 864), McpPattern()), CameraFormat(160, 120, 8))
+        (folder / "capture").mkdir()
+        (folder / "capture" / "capture.json").write_text(
+            json.dumps(replace(header, id=told, frames=("0.png",)).as_dict())
+        )
+    for again, words in (
+        (boards[0] + "/../b0", "is given twice"),
+        (copy, "is a copy of"),
+        (str(anew), "captured anew, which only simulated rigs do"),
+    ):
         capsys.readouterr()
         assert main(["calibrate", "verify", boards[0], boards[1], again, "--repeat"]) == 2
-        assert words in " ".join(capsys.readouterr().err.split())
+        said = " ".join(capsys.readouterr().err.split())
+        assert words in said
+        assert ("?seed=2" in said) == ("anew" in words)
+    assert main(["calibrate", "verify", boards[0], "--edge", "40,10,80,100", "--tolerance", "1"]) == 2
+    far = str(save(tmp_path / "far", board(0.02, seed=7) + np.array([0, 0, 30.0])))
+    capsys.readouterr()
+    assert main(["calibrate", "verify", boards[0], far, "--repeat"]) == 1
+    assert "shows another scene than" in capsys.readouterr().err
     ball_folder = str(save(tmp_path / "ball", ball(noise_mm=0.01)))
     assert main(["calibrate", "verify", ball_folder, "--sphere", "50", "--tolerance", "0.2"]) == 0
     shown = capsys.readouterr()

@@ -256,7 +256,7 @@ def test_verify_takes_the_calibration_that_made_the_scan_and_no_other(tmp_path, 
         r"form dispersion +0\.\d+ \+- 0\.\d+ mm, ISO 10360-13, 95 % of the points; a perfect sphere has", said
     )
     # U contains the calibration: only the others are said to be in none of the figures.
-    assert "+-0.032 mm of depth (k = 2) besides the calibration, in none of these figures; unknown: sync" in said
+    assert "at least +-0.032 mm of depth (k = 2) besides the calibration, and what is unknown (sync); in none" in said
     save(tmp_path / "b", *ball(), "another")
     without, other = tmp_path / "without.json", tmp_path / "other.json"
     without.write_text(json.dumps(rig(covariance=None)))

@@ -1,0 +1,216 @@
+"""What `fringed calibrate verify` says of its document: tables, lines, warnings, and which error is the largest."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from scanner.digits import UNKNOWN_PLACES, alone, places_of, rounded, with_uncertainty
+from scanner.stated_length import dominates
+from service.terminal import print_error, print_facts, print_table
+
+WORTH_MM = 0.01
+"""Uncertainty that a figure has at the least where nothing of it is known: no digit beyond a micrometre is shown"""
+LEAST_MM = 0.0001
+ABSOLUTE = ("distance_mm", "diameter_mm", "size_mm", "measured_mm", "error_mm")
+"""Figures that move with all depths; the others compare depths with one another"""
+
+
+WIDTHS = (
+    ("flat", "flatness_mm", "noise_mm", "flatness F", "VDI/VDE 2634-2, 99.7 % of the points"),
+    ("sphere", "form_mm", "noise_mm", "probing form PF", "VDI/VDE 2634-2, 99.7 % of the points"),
+    ("sphere", "shell_mm", "shell_noise_mm", "form dispersion", "ISO 10360-13, 95 % of the points"),
+)
+"""Figures that norms define: kind, name, what noise alone makes of it, in words, and which norm"""
+
+
+def _of_widths(one: dict[str, Any]) -> list[tuple[str, str]]:
+    """Lines of what norms define, in their words, each with what of it is noise."""
+    lines = []
+    for kind, name, of_noise, called, norm in WIDTHS:
+        if kind not in one:
+            continue
+        width, noise = one[kind][name], one[kind][of_noise]
+        expanded = one[kind]["uncertainty"][name]["expanded"]
+        known = _known(one, kind, name)
+        shown = with_uncertainty(width, expanded, known)
+        by = "what noise makes of it is not known"
+        if noise is not None:
+            by = _beyond(width, noise, expanded, known, kind)
+        lines.append((called, f"{shown} mm, {norm}; {by}: {one['scan']}"))
+    return lines
+
+
+def _beyond(width: float, noise: float, expanded: float | None, known: float, kind: str) -> str:
+    """What a width has beyond that of noise, in quadrature, as normal deviations add up; U: the width's, carried on."""
+    feature = "board" if kind == "flat" else "sphere"
+    own = (
+        f"a perfect {feature} has {rounded(noise, min(places_of(known if expanded is None else expanded), 4))} by noise"
+    )
+    beyond = math.sqrt(max(width**2 - noise**2, 0.0))
+    if beyond > 0:
+        slope = width / beyond
+        unsure = None if expanded is None else slope * expanded
+        return f"{own}, beyond it {with_uncertainty(beyond, unsure, slope * known)}"
+    if expanded is None:
+        return f"{own}, nothing beyond it (+- unknown)"
+    most = math.sqrt(max((width + expanded) ** 2 - noise**2, 0.0))
+    return f"{own}, nothing beyond it ({f'{alone(most)} at most' if most > 0 else 'nor within U'})"
+
+
+def _known(one: dict[str, Any], kind: str, name: str) -> float:
+    """Of a figure's unknown U what is known of it, k = 2: the points' part, and, of what moves with all depths, the
+    known systematic part of the scan's."""
+    random = one[kind]["uncertainty"][name]["random"] or 0.0
+    besides = one.get("systematic_besides") or {}
+    common = besides.get("mm", 0.0) if name in ABSOLUTE else 0.0
+    return max(2 * math.hypot(random, common), WORTH_MM)
+
+
+@dataclass(frozen=True)
+class Error:
+    """One that a tolerance is for. mm; expanded: U, None where it is unknown; known: the part of U that is; of: what
+    it is an error of."""
+
+    mm: float
+    expanded: float | None
+    known: float
+    of: str
+
+    @property
+    def words(self) -> str:
+        """With its uncertainty."""
+        return f"{with_uncertainty(self.mm, self.expanded, self.known)} mm, {self.of}"
+
+
+def errors_of(document: dict[str, Any]) -> list[Error]:
+    """All errors that a tolerance is for. No width of edges; no mark that is hidden."""
+    return [*_of_repeating(document), *(error for one in document["scans"] for error in _of_scan(one))]
+
+
+def _of_repeating(document: dict[str, Any]) -> Iterator[Error]:
+    if "repeatability" in document:
+        found = document["repeatability"]
+        expanded = found["uncertainty"]["depth_mm"]["expanded"]
+        yield Error(found["depth_mm"], expanded, WORTH_MM, "the repeatability")
+
+
+def _of_scan(one: dict[str, Any]) -> Iterator[Error]:
+    for kind, name, of in (
+        ("flat", "flatness_mm", "the flatness"),
+        ("sphere", "form_mm", "the sphere's form"),
+        ("sphere", "size_mm", "the sphere's size"),
+        ("length", "error_mm", "the length"),
+    ):
+        if kind in one:
+            expanded = one[kind]["uncertainty"][name]["expanded"]
+            yield Error(abs(one[kind][name]), expanded, _known(one, kind, name), f"{of} of {one['scan']}")
+    marks = one.get("marks") or {}
+    if marks.get("largest_mm") is not None:
+        yield Error(marks["largest_mm"], None, WORTH_MM, f"a witness mark in {one['scan']}")
+    if (offset := (marks.get("plate") or {}).get("offset_mm")) is not None:
+        yield Error(abs(offset), None, WORTH_MM, f"the plate in {one['scan']}")
+
+
+def met(errors: Sequence[Error], worst: Error, tolerance: float) -> str:
+    """What a tolerance that is met does not say: errors are compared as measured (ISO 14253-1 would have U added)."""
+    said = f"the largest error, {worst.words}, is within {tolerance:g} mm as measured; "
+    if any(error.expanded is None for error in errors):
+        return said + "whether it is with its uncertainty is not known"
+    most, of = max((error.mm + (error.expanded or 0.0), error.of) for error in errors)
+    which = "" if of == worst.of else f" ({of})"
+    within = "too" if most <= tolerance else "not"
+    return said + f"with its expanded uncertainty (k = 2), {most:.4f} mm{which}, it is {within}"
+
+
+def warnings_in(document: dict[str, Any]) -> list[str]:
+    """Of marks, of figures of a part of a board, and of scans that do not repeat each other."""
+    found = [f"--repeat: {said}" for said in (document.get("repeatability") or {}).get("warnings", ())]
+    for one in document["scans"]:
+        own = [*one.get("warnings", ()), one.get("marks", {}).get("warning")]
+        found += [f"{one['scan']}: {said}" for said in own if said is not None]
+    return found
+
+
+def show(document: dict[str, Any], worst: Error | None) -> None:
+    """Print it."""
+    for kind in ("flat", "sphere", "length", "edge", "marks"):
+        rows = [(one["scan"], _cells_of(kind, one)) for one in document["scans"] if kind in one]
+        if not rows:
+            continue
+        names = list(dict.fromkeys(name for _, values in rows for name in values))
+        cells = ([scan, *(values.get(name, "-") for name in names)] for scan, values in rows)
+        print_table(kind, ("scan", *(name.replace("_", " ") for name in names)), cells)
+    facts = [line for one in document["scans"] for line in _of_widths(one)]
+    facts += _of_repeats(document.get("repeatability"))
+    if worst is not None:
+        facts.append(("largest error", f"{worst.words}, as measured"))
+    for one in document["scans"]:
+        if "coverage_factor" in one:
+            facts.append(("+-", f"{_of_uncertainty(one)}: {one['scan']}"))
+        facts.append(("systematic", f"{_of_systematic(one['systematic_besides'])}: {one['scan']}"))
+    print_facts("verification", facts)
+    # Of the scan whose figure it dominates most: twenty notes say no more than one.
+    stated = [one["stated_length"] for one in document["scans"] if one.get("stated_length") is not None]
+    if (hint := dominates(max(stated, key=lambda found: float(found["share"]), default=None))) is not None:
+        print_error(hint, label="note")
+
+
+def _of_repeats(found: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """Lines of a repeatability."""
+    if found is None:
+        return []
+    shown = with_uncertainty(found["depth_mm"], found["uncertainty"]["depth_mm"]["expanded"], WORTH_MM)
+    of = f"standard deviation of {found['scans']} scans (k = 2), rms over {found['points']:,} pixels"
+    if found["uncertainty"]["depth_mm"]["expanded"] is None:
+        of += "; from three scans on they say whether noise or a change makes it"
+    drift = rounded(found["drift_mm"]) if found["drift_mm"] > LEAST_MM else f"below {LEAST_MM:g}"
+    return [("depth mm", f"{shown}: {of}"), ("drift mm", f"{drift}, of the farthest scan's mean")]
+
+
+def _of_systematic(besides: dict[str, Any] | None) -> str:
+    """What is in none of a scan's uncertainties, in words: what is unknown is no zero."""
+    if besides is None:
+        return "not told, in none of these figures"
+    whole = "" if besides["calibration"] else " besides the calibration"
+    unknown = ", ".join(besides["unknown"])
+    if not besides["mm"] > 0:
+        said = f"unknown ({unknown})" if unknown else "none is known of"
+        return f"{said}{whole}; in none of these figures"
+    known = f"{alone(2 * besides['mm'])} mm of depth (k = 2){whole}"
+    if unknown:
+        return f"at least +-{known}, and what is unknown ({unknown}); in none of these figures"
+    return f"+-{known}, in none of these figures"
+
+
+def _of_uncertainty(one: dict[str, Any]) -> str:
+    """What the uncertainties of a scan's figures contain, and why they are unknown where they are."""
+    if one["unknown"] is None:
+        return "expanded uncertainty, k = 2: the calibration's covariance, and the points"
+    parts = [one[kind]["uncertainty"] for kind in ("flat", "sphere", "length") if kind in one]
+    largest = max(
+        (s["random"] for part in parts for n, s in part.items() if n.endswith("_mm") and s["random"]), default=0
+    )
+    return f"unknown, {one['unknown']}; the points' own part, k = 2, is up to {alone(2 * largest)} mm"
+
+
+def _cells_of(kind: str, one: dict[str, Any]) -> dict[str, Any]:
+    """What is shown of one feature: marks without what does not apply, and the plate's members beside them."""
+    shown = values = one[kind]
+    if kind == "marks":
+        plate = {f"plate_{name}": value for name, value in (values.get("plate") or {}).items()}
+        left_out = () if values["points"] else ("seen",)
+        shown = {name: value for name, value in values.items() if name not in left_out} | plate
+    cells = {}
+    for name, value in shown.items():
+        if name in values.get("uncertainty", {}):
+            cells[name] = with_uncertainty(value, values["uncertainty"][name]["expanded"], _known(one, kind, name))
+        elif isinstance(value, int | float):
+            cells[name] = _cell(value, 3 if name.endswith("_mm") else UNKNOWN_PLACES)
+    return cells
+
+
+def _cell(value: float, places: int) -> str:
+    return f"{value:,}" if isinstance(value, int) else rounded(value, places)
