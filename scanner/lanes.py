@@ -344,14 +344,19 @@ samples: Callable[[NDArray[Any], int, int, NDArray[Any]], Lanes] = _intrinsic(_s
 Those of 8 bits are short numbers, of which 128 may be added up; all others whole numbers."""
 
 
+def fetch_soon(builder: Any, address: Any) -> None:
+    """Have the processor fetch the cache line of an address into its second cache; it never faults."""
+    # llvm.prefetch(pointer, read, to the second-level cache, data).
+    pointer, integer = _compiler.voidptr_t, ir.IntType(32)
+    kind = ir.FunctionType(ir.VoidType(), [pointer, integer, integer, integer])
+    call = _compiler.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+    options = [ir.Constant(integer, value) for value in (0, 2, 1)]
+    builder.call(call, [builder.inttoptr(address, pointer), *options])
+
+
 def _expect(context: Any, addresses: Any, frame: Any, pixel: Any, like: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        # llvm.prefetch(pointer, read, to the second-level cache, data); it never faults.
-        pointer, integer = _compiler.voidptr_t, ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [pointer, integer, integer, integer])
-        call = _compiler.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        options = [ir.Constant(integer, value) for value in (0, 2, 1)]
-        builder.call(call, [builder.inttoptr(address_of(context, builder, signature, values), pointer), *options])
+        fetch_soon(builder, address_of(context, builder, signature, values))
         return context.get_dummy_value()
 
     return types.void(addresses, types.intp, types.intp, like), generate

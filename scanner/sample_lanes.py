@@ -19,7 +19,9 @@ from numba import extending, types
 from numba.core import cgutils
 from numpy.typing import NDArray
 
-from scanner.lanes import FLOATS, LANES, Lanes, address_of, greatest, intrinsic, least, pointer_to
+from scanner.lanes import FLOATS, LANES, Lanes, address_of, fetch_soon, greatest, intrinsic, least, pointer_to
+
+_CACHE_LINE = 64
 
 LINE = 2 * LANES
 """Samples a line."""
@@ -198,6 +200,20 @@ line_of: Callable[[NDArray[Any], int, int, NDArray[Any]], Line] = intrinsic(_lin
 """line_of(addresses, n, pixel, like): grey levels of the n-th frame from a pixel on; as `scanner.lanes.samples`."""
 
 
+def _expect_line(context: Any, addresses: Any, frame: Any, pixel: Any, like: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        first = address_of(context, builder, signature, values)
+        for at in range(0, LINE * like.dtype.bitwidth // 8, _CACHE_LINE):
+            fetch_soon(builder, builder.add(first, ir.Constant(first.type, at)))
+        return context.get_dummy_value()
+
+    return types.void(addresses, types.intp, types.intp, like), generate
+
+
+expect_line: Callable[[NDArray[Any], int, int, NDArray[Any]], None] = intrinsic(_expect_line)
+"""expect_line(addresses, n, pixel, like): as `scanner.lanes.expect`, for all that `line_of` reads."""
+
+
 def _line_at(context: Any, array: Any, at: Any) -> Any:
     kind = _LINES[array.dtype.bitwidth]
 
@@ -227,25 +243,43 @@ keep_line: Callable[[NDArray[Any], int, Line], None] = intrinsic(_keep_line)
 """keep_line(row, at, line): a line into a (n,) array of its type. See `line_at`."""
 
 
-def _keep_words(context: Any, array: Any, at: Any, low: Any, high: Any) -> Any:
-    bits = array.dtype.bitwidth
+def _keeping(change: Callable[[Any, Any, int], Any]) -> Any:
+    """Keep words of two halves, after change(builder, words, their bits)."""
 
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        row, first, below, above = values
-        words = ir.VectorType(ir.IntType(bits), LINE)
-        if bits > low.bits:
-            shift = ir.Constant(words, [low.bits] * LINE)
-            below = builder.or_(builder.zext(below, words), builder.shl(builder.zext(above, words), shift))
-        builder.store(below, pointer_to(context, builder, array, row, first, words), align=bits // 8)
-        return context.get_dummy_value()
+    def keep(context: Any, array: Any, at: Any, low: Any, high: Any) -> Any:
+        bits = array.dtype.bitwidth
 
-    fits = low == high and isinstance(low, _LineType) and bits in (low.bits, 2 * low.bits)
-    return (types.void(array, types.intp, low, high), generate) if fits else None
+        def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            row, first, below, above = values
+            words = ir.VectorType(ir.IntType(bits), LINE)
+            if bits > low.bits:
+                shift = ir.Constant(words, [low.bits] * LINE)
+                below = builder.or_(builder.zext(below, words), builder.shl(builder.zext(above, words), shift))
+            pointer = pointer_to(context, builder, array, row, first, words)
+            builder.store(change(builder, below, bits), pointer, align=bits // 8)
+            return context.get_dummy_value()
+
+        fits = low == high and isinstance(low, _LineType) and bits in (low.bits, 2 * low.bits)
+        return (types.void(array, types.intp, low, high), generate) if fits else None
+
+    return intrinsic(keep)
 
 
-keep_words: Callable[[NDArray[Any], int, Line, Line], None] = intrinsic(_keep_words)
+def _summed(builder: Any, words: Any, bits: int) -> Any:
+    step = bits // 2
+    while step:
+        words = builder.xor(words, builder.lshr(words, ir.Constant(words.type, [step] * LINE)))
+        step //= 2
+    return words
+
+
+keep_words: Callable[[NDArray[Any], int, Line, Line], None] = _keeping(lambda builder, words, bits: words)
 """keep_words(row, at, low, high): numbers whose halves these are into a (n,) array of unsigned ones of twice the bits;
 into one of as many bits the low halves alone."""
+
+keep_gray: Callable[[NDArray[Any], int, Line, Line], None] = _keeping(_summed)
+"""keep_gray(row, at, low, high): as `keep_words`, of words of a Gray code their numbers: each bit is the sum of all of
+the word's from the highest to it."""
 
 
 def _floats_at(context: Any, array: Any, at: Any) -> Any:

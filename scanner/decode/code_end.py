@@ -17,6 +17,7 @@ from scanner.decode import Map
 from scanner.decode.addresses import pixels_at
 from scanner.decode.near_ends import boxes_near_ends
 from scanner.kernel import kernel
+from scanner.sample_lanes import LINE
 
 ALSO_NEAR_PX = 4.0
 """Beyond the end's cell, projector px: a blur of 4 px draws inward by no more what lies beyond the end"""
@@ -24,6 +25,12 @@ ALSO_NEAR_PX = 4.0
 AROUND = (8, 16)
 """Camera pixels to those that a pixel is held against, in all four directions: the nearer ones are of its surface, the
 farther ones clear of a wide blur"""
+
+
+def between_ends(along: int, cell_px: int, least_share: float) -> tuple[float, float]:
+    """Places below and above which `beyond_ends` looks at a pixel, projector px. Arguments: see there."""
+    near = cell_px + ALSO_NEAR_PX if least_share else 0.0
+    return near - 0.5, along - 0.5 - near
 
 
 def beyond_ends(
@@ -34,6 +41,7 @@ def beyond_ends(
     least_share: float,
     pairs: NDArray[np.intp],
     like: NDArray[Any],
+    marked: NDArray[np.uint8],
 ) -> NDArray[np.intp]:
     """Pixels that look beyond an end of the field, by their contrast.
 
@@ -43,9 +51,12 @@ def beyond_ends(
         least_share: of the contrast around that a pixel inside has.
         pairs: (N, 2) addresses of frames that differ by the contrast, which is that of the pair that differs most.
         like: (0,) of the frames' dtype.
+        marked: (P / LINE and more,) 1 where any pixel of a line of LINE is not `between_ends`; others may be 1, too.
     """
+    if not least_share or not marked.any():
+        return np.empty(0, np.intp)
     found = [
-        _beyond(position, width, box, along, end == 1, cell_px + ALSO_NEAR_PX, least_share, pairs, like)
+        _beyond(position, width, box, along, end == 1, cell_px + ALSO_NEAR_PX, least_share, pairs, like, marked)
         for end, box in boxes_near_ends(position, width, along).items()
     ]
     return np.unique(np.concatenate(found)) if found else np.empty(0, np.intp)
@@ -62,13 +73,19 @@ def _beyond(
     least_share: float,
     pairs: NDArray[np.intp],
     like: NDArray[Any],
+    marked: NDArray[np.uint8],
 ) -> NDArray[np.intp]:
     """One end's, within its box: top, bottom, left, right."""
     top, bottom, left, right = box
     height, found = position.size // width, 0
-    out = np.empty(max((bottom - top) * (right - left), 0), np.intp)
+    out = np.empty(LINE * np.count_nonzero(marked), np.intp)
     for y in range(top, bottom):
-        for x in range(left, right):
+        x = left
+        while x < right:
+            line = (y * width + x) // LINE
+            if marked[line] == 0:
+                x = (line + 1) * LINE - y * width
+                continue
             inside = position[y * width + x] + np.float32(0.5)
             if (along - inside if last else inside) < near:
                 best = np.float32(0)
@@ -79,6 +96,7 @@ def _beyond(
                 if _contrast(y * width + x, pairs, like) < np.float32(least_share) * best:
                     out[found] = y * width + x
                     found += 1
+            x += 1
     return out[:found]
 
 

@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 
 from scanner.decode import Coordinates, Decoded, Map, Reason
 from scanner.decode.addresses import addresses_of, maps_to_fill
-from scanner.decode.code_end import beyond_ends
+from scanner.decode.code_end import between_ends, beyond_ends
 from scanner.decode.frames import FrameCheck
 from scanner.decode.graycode_bits import BOTH, INVERSE, PLAIN
 from scanner.decode.graycode_blur import blurred_bits, share_to_count, shares_decided
-from scanner.decode.graycode_kernels import decode_codes
 from scanner.decode.graycode_noise import noise_factor
+from scanner.decode.graycode_strips import decode_code_strips
 from scanner.decode.noise import ROUNDING_VARIANCE, default_noise
 from scanner.decode.reasons import REASONS
 from scanner.decode.runs import runs_of
-from scanner.decode.strips import in_strips, threads_to_use
+from scanner.decode.strips import Shared, begins_of, threads_to_use
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, GrayPattern, PatternSequence, ProjectorSize
 from scanner.patterns.description import Axis
@@ -127,6 +127,8 @@ class GrayDecoder:
         self._pixels, whole_lines = pixels, -(-pixels // LINE) * LINE
         self._maps = maps_to_fill(2 * len(pattern.axes) + 3, whole_lines)
         self._reason = np.full(whole_lines, 0, np.uint8)
+        # Lines with pixels near an end of the field, by axis.
+        self._marked = np.full((len(pattern.axes), whole_lines // LINE), 0, np.uint8)
 
     def add(self, position: int, frame: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
         """Take a copy of the frame at `position`.
@@ -233,32 +235,39 @@ class GrayDecoder:
         How many pixels have each reason, the noise's factor, and what a user should know.
         """
         codes = self._codes()
-        warnings, factor = self._check_complete(codes), self._noise_factor(codes)
+        warnings = self._check_complete(codes)
         pattern, t = self._pattern, self._thresholds
         max_value = self._camera.max_value
         model = default_noise(max_value)
-        twice = np.empty(0, np.uint16 if codes.like.itemsize == 1 else np.uint32)
+        noise = np.array([model.read, model.per_level, ROUNDING_VARIANCE, 1], np.float32)
+        sizes = np.array([self._sequence.projector.along(axis) for axis in pattern.axes])
+        cell = self._cell_px
+        ends = [np.add(between_ends(along, cell, t.least_end_share), 0.5) / cell - 0.5 for along in sizes.tolist()]
         arguments = (
-            codes.addresses, codes.kinds, codes.levels, codes.like, twice, codes.coarse,
+            codes.addresses, codes.kinds, codes.levels, codes.like,
+            np.empty(0, np.uint16 if codes.like.itemsize == 1 else np.uint32), codes.coarse,
             max(int(np.ceil(t.saturation * max_value)), 1), pattern.code == "gray", pattern.code_bits - pattern.bits,
-            np.array([self._sequence.projector.along(axis) for axis in pattern.axes]),
-            np.array([model.read, model.per_level, ROUNDING_VARIANCE, factor], np.float32),
+            sizes, noise,
             np.array([t.min_contrast_levels, t.min_contrast_sigmas**2, t.decisive_share, t.decisive_sigmas**2,
                       1 - t.min_code_probability, t.max_open_cells, max_value], np.float32),
+            np.array(ends, np.float32), brief, share_to_count(self._reason.size // LINE), self._maps, self._reason,
+            self._marked, begins_of(self._pixels, self._threads),
         )  # fmt: skip
-        share = share_to_count(self._reason.size // LINE)
 
-        def decode(begin: int, end: int) -> NDArray[np.int64]:
-            counts = np.zeros(REASONS + codes.kinds.size + 1, np.int64)
-            decode_codes(
-                *arguments, begin, end, brief, share, self._maps, self._reason, counts[:REASONS], counts[REASONS:]
-            )
-            return counts
+        def take_strips(gate: NDArray[np.int64], counts: NDArray[np.int64]) -> bool:
+            return decode_code_strips(*arguments, gate, counts)
 
-        counts = np.asarray(np.sum(in_strips(decode, self._pixels, self._threads), axis=0))
+        with Shared(take_strips, self._threads, REASONS + codes.kinds.size + 1) as shared:
+            noise[3] = factor = self._noise_factor(codes)
+            shared.open()
+            counts = shared.finish()
         shares = shares_decided(counts[REASONS:], codes.kinds.shape)
         self._leave_ends_out(codes, counts)
         return counts[:REASONS], factor, (*warnings, *blurred_bits(pattern, shares))
+
+    @property
+    def _cell_px(self) -> int:
+        return 1 << (self._pattern.code_bits - self._pattern.bits)
 
     def _leave_ends_out(self, codes: _Codes, counts: NDArray[np.int64]) -> None:
         """Pixels that look beyond the field have no values."""
@@ -268,8 +277,10 @@ class GrayDecoder:
         for index, axis in enumerate(pattern.axes if share else ()):
             out = beyond_ends(
                 self._maps[index, : self._pixels], self._camera.width, self._sequence.projector.along(axis),
-                1 << (pattern.code_bits - pattern.bits), share, pairs if codes.has_levels else pairs[index], codes.like,
+                self._cell_px, share, pairs if codes.has_levels else pairs[index], codes.like, self._marked[index],
             )  # fmt: skip
+            if not out.size:
+                continue
             self._maps[: 2 * axes, out], self._maps[2 * axes, out] = np.nan, 0
             self._reason[out] = Reason.BORDER
             counts[Reason.VALUE] -= out.size

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scanner.decode.addresses import aligned_rows, copies_of, keep
 from scanner.decode.graycode_bits import (
-    ADDING,
+    APART,
     BOTH,
     CELL,
     NEAR,
@@ -28,9 +28,10 @@ from scanner.decode.graycode_bits import (
     ONES,
     OPEN,
     WEIGHTS,
+    any_open,
+    compare_images,
     count_decided,
-    read_bits,
-    sum_pairs,
+    find_open,
     value_and_spread,
 )
 from scanner.decode.graycode_light import BOTH_IMAGES, SINGLE, SURE2, find_bright, judge_light, light_and_dark
@@ -87,12 +88,14 @@ def decode_codes(
     sizes: NDArray[np.int64],
     noise: NDArray[np.float32],
     limits: NDArray[np.float32],
-    begin: int,
-    end: int,
+    ends: NDArray[np.float32],
     brief: bool,
     share: int,
     maps: NDArray[np.float32],
     reason: NDArray[np.uint8],
+    marked: NDArray[np.uint8],
+    begin: int,
+    end: int,
     counts: NDArray[np.int64],
     decided: NDArray[np.int64],
 ) -> None:
@@ -108,19 +111,21 @@ def decode_codes(
         noise: [variance at level 0, variance per level, least variance, factor].
         limits: [contrast in levels, contrast in sigmas squared, decisive share of the contrast, decisive sigmas
             squared, wrong-bit probability, cells from the first to the last that open bits leave, largest grey level].
+        ends: (A, 2) cells, below and above which a pixel has its line marked.
         brief: write positions, confidence and reason alone.
         share: of all lines of pixels times 2^32, those whose decided bits are counted.
         maps: (2 A + 3, P + up to LINE) float32 whose rows begin with a cache line; positions, sigmas, confidence,
             albedo, modulation. reason: (P + up to LINE,) uint8. Both are written up to a multiple of LINE.
+        marked: (A, P / LINE, rounded up) uint8, set to 1 where any pixel of a line is outside `ends`.
         counts: (9,) int64, how many pixels have each reason, is added to. decided: see `count_decided`.
     """
     align_stack()
     table, flat, stride, axes = addresses.reshape(-1), maps.reshape(-1), maps.shape[1], kinds.shape[0]
     spot = aligned_rows(2 * axes, LANES).reshape(-1)
-    lines = aligned_rows(NEAR + axes * OF_NEAR, LINE).reshape(-1).view(like.dtype)
+    lines = aligned_rows(APART + kinds.size, LINE).reshape(-1).view(like.dtype)
     sums, words = aligned_rows(2, LINE).reshape(-1).view(twice.dtype), np.empty(axes * OF_WORDS * LINE, np.uint16)
+    lines[:] = 0
     lines[ONES * LINE : (ONES + 1) * LINE] = 1
-    lines[ADDING * LINE : (ADDING + 1) * LINE] = 1 if gray else 0
     for bit in range(kinds.shape[1]):
         weight = 1 << ((kinds.shape[1] - 1 - bit) % (8 * like.itemsize))
         lines[(WEIGHTS + bit) * LINE : (WEIGHTS + bit + 1) * LINE] = weight
@@ -131,26 +136,28 @@ def decode_codes(
             pairs[axis] += 1 if kinds[axis, bit] == BOTH else 0
         pairs[axes] += pairs[axis]
     solid = end // LINE * LINE
-    for at in range(begin, solid, LINE):
-        _decode_line(
-            addresses, kinds, pairs, levels, like, coarse, clip, gray, shift, sizes, noise, limits, brief, share,
-            at, stride, spot, lines, sums, words, near, flat, reason, decided,
-        )  # fmt: skip
+    for first in range(begin, solid, STRETCH):
+        last = min(first + STRETCH, solid)
+        for at in range(first, last, LINE):
+            _decode_line(
+                addresses, kinds, pairs, levels, like, coarse, clip, gray, shift, sizes, noise, limits, ends, brief,
+                share, at, stride, spot, lines, sums, words, near, flat, reason, marked, decided,
+            )  # fmt: skip
+        count_reasons(reason[first:last], counts)
     if solid < end:
         # What is left goes into lines of its own: nothing may be read beyond a frame's last pixel.
         spare, spare_levels = np.zeros((table.size, LINE), like.dtype), np.zeros((2, LINE), like.dtype)
-        last = copies_of(table, solid, end - solid, like, spare)
+        copies = copies_of(table, solid, end - solid, like, spare)
         of_levels = copies_of(levels, solid, end - solid, like, spare_levels)
         _decode_line(
-            last.reshape(addresses.shape), kinds, pairs, of_levels, like, coarse, clip, gray, shift, sizes, noise,
-            limits, brief, share, solid, stride, spot, lines, sums, words, near, flat, reason, decided,
+            copies.reshape(addresses.shape), kinds, pairs, of_levels, like, coarse, clip, gray, shift, sizes, noise,
+            limits, ends, brief, share, solid, stride, spot, lines, sums, words, near, flat, reason, marked, decided,
         )  # fmt: skip
         keep(spare)
         keep(spare_levels)
+        count_reasons(reason[solid:end], counts)
     # Mentioned once more: see `copies_of`.
     lines[0], words[0] = 0, 0
-    for at in range(begin, end, STRETCH):
-        count_reasons(reason[at : min(at + STRETCH, end)], counts)
 
 
 @inlined_kernel
@@ -167,6 +174,7 @@ def _decode_line(
     sizes: NDArray[np.int64],
     noise: NDArray[np.float32],
     limits: NDArray[np.float32],
+    ends: NDArray[np.float32],
     brief: bool,
     share: int,
     at: int,
@@ -178,6 +186,7 @@ def _decode_line(
     near: NDArray[np.intp],
     maps: NDArray[np.float32],
     reason: NDArray[np.uint8],
+    marked: NDArray[np.uint8],
     decided: NDArray[np.int64],
 ) -> None:
     """Decode LINE pixels from `at` on.
@@ -189,36 +198,36 @@ def _decode_line(
     """
     axes, bits, top = kinds.shape[0], kinds.shape[1], int(limits[6])
     has_pairs, has_single = bool(pairs[axes] > 0), bool(pairs[axes] < axes * bits)
-    if levels[0] == 0:
-        sum_pairs(addresses, coarse, at, like, lines, sums)
-    margins, opened = False, False
+    summed = 0 if levels[0] != 0 else coarse
+    # Whether all are pairs is known when each of these is compiled.
+    if has_single:
+        compare_images(addresses, kinds, levels, summed, at, like, top, gray, False, lines, sums, words)
+    else:
+        compare_images(addresses, kinds, levels, summed, at, like, top, gray, True, lines, sums, words)
+    margins = False
     for half in range(0, LINE, LANES):
         margins |= judge_light(
             has_pairs, has_single, levels, like, axes * coarse, clip, noise, limits, at, half, lines, sums, reason
         )
-    for axis in range(axes):
-        # Whether all are pairs and margins are kept is known when each of these is compiled.
-        if margins:
-            opened |= read_bits(addresses, kinds, levels, axis, at, like, top, False, True, lines, words)
-        elif has_single:
-            opened |= read_bits(addresses, kinds, levels, axis, at, like, top, False, False, lines, words)
-        else:
-            opened |= read_bits(addresses, kinds, levels, axis, at, like, top, True, False, lines, words)
+    opened = any_open(not has_single, lines)
+    if margins or opened:
+        for axis in range(axes):
+            find_open(kinds, axis, like, top, margins, lines, words)
     # Places that fall into no step with the image's width.
     if at // LINE * _GOLDEN & _WORD < share:
         for half in range(0, LINE, LANES):
             find_bright(has_single, levels, like, axes * coarse, noise, limits, at, half, lines, sums)
-        count_decided(addresses, kinds, levels, at, like, top, lines, decided)
+        count_decided(kinds, lines, decided)
     for half in range(0, LINE, LANES):
         if margins or opened:
             _judge_words(
-                kinds, pairs, levels, like, axes * coarse, gray, shift, sizes, noise, limits, brief, margins, True,
-                at, half, stride, spot, lines, sums, words, near, maps, reason,
+                kinds, pairs, levels, like, axes * coarse, gray, shift, sizes, noise, limits, ends, brief, margins,
+                True, at, half, stride, spot, lines, sums, words, near, maps, reason, marked,
             )  # fmt: skip
         else:
             _judge_words(
-                kinds, pairs, levels, like, axes * coarse, gray, shift, sizes, noise, limits, brief, margins, False,
-                at, half, stride, spot, lines, sums, words, near, maps, reason,
+                kinds, pairs, levels, like, axes * coarse, gray, shift, sizes, noise, limits, ends, brief, margins,
+                False, at, half, stride, spot, lines, sums, words, near, maps, reason, marked,
             )  # fmt: skip
 
 
@@ -234,6 +243,7 @@ def _judge_words(
     sizes: NDArray[np.int64],
     noise: NDArray[np.float32],
     limits: NDArray[np.float32],
+    ends: NDArray[np.float32],
     brief: bool,
     margins: bool,
     unsure: bool,
@@ -247,6 +257,7 @@ def _judge_words(
     near: NDArray[np.intp],
     maps: NDArray[np.float32],
     reason: NDArray[np.uint8],
+    marked: NDArray[np.uint8],
 ) -> None:
     """Positions of LANES pixels from the bits that were read. unsure: some of them are open, or near the limit."""
     axes, bits = kinds.shape
@@ -286,7 +297,9 @@ def _judge_words(
                 store(spot, (axes + axis) * LANES, (spread + _F1) * (step / _ROOT12))
         else:
             value = floats_at(words, place + CELL * LINE)
-        why = choose(why > 0, why, choose(value * step >= np.float32(sizes[axis]), as_samples(5, reason), 0))
+        if any_of((value < ends[axis, 0]) | (value > ends[axis, 1])):
+            marked[axis, at // LINE] = 1
+            why = choose(why > 0, why, choose(value * step >= np.float32(sizes[axis]), as_samples(5, reason), 0))
         store(spot, axis * LANES, (value + _HALF) * step - _HALF)
     good, place = why < 1, at + half
     for row in range(axes):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -92,18 +94,21 @@ def test_positions_are_those_of_the_plain_form(code, inverse, levels, axes):
     np.testing.assert_allclose(np.median(found.modulation), 0.4 * 255, atol=1)
 
 
-def test_coordinates_alone_are_those_of_all_maps():
+def test_coordinates_alone_are_those_of_all_maps_and_threads_change_nothing():
     sequence = sequence_of(GrayPattern(("x", "y"), bits=7, code_bits=9))
     camera = CameraFormat(203, 149)
     frames = [frame for frame in take(sequence, camera, noise=0.05) if frame[0] != 5]
-    expected, brief = decode(sequence, frames, camera), GrayDecoder(sequence, camera)
-    for position, frame in frames:
-        brief.add(position, frame)
-    found = brief.coordinates()
+    expected, brief, shared = (GrayDecoder(sequence, camera, threads=threads) for threads in (1, 2, 3))
+    for (position, frame), decoder in itertools.product(frames, (expected, brief, shared)):
+        decoder.add(position, frame)
+    expected, found, shared = expected.finish(), brief.coordinates(), shared.finish()
     assert 0.2 < np.isfinite(found.rows).mean() < 1
     for name in ("rows", "columns", "confidence"):
         assert np.array_equal(getattr(found, name), getattr(expected, name), equal_nan=True)
     assert found.warnings == expected.warnings != ()
+    assert (shared.warnings, shared.details) == (expected.warnings, expected.details)
+    for name in ("rows", "columns", "sigma_rows", "sigma_columns", "confidence", "albedo", "modulation", "reason"):
+        assert np.array_equal(getattr(shared, name), getattr(expected, name), equal_nan=True), name
 
 
 def sigma_or(found):
