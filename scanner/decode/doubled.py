@@ -3,8 +3,8 @@
 Told from a sample of pixels, set by set: an order of the frames that leaves much less than the one that was meant, and
 no more than noise would (`frame_orders`). Whether a capture is in step is asked with more care, and before anything
 else, by the sequencer's witnesses, which refuse it; this is for frames that come to a decoder without them. With three
-shifts nothing is left to tell a doubled frame by unless it is the same to the last bit, and a set that is rotated as a
-whole leaves nothing at any number.
+shifts nothing is left but the set's mean light, which a doubled frame changes and an exchange does not. A set that is
+rotated as a whole leaves nothing at any number (`rotated`).
 """
 
 from __future__ import annotations
@@ -17,15 +17,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.decode.frame_orders import NONE, Order, least_left, left_beside_overtones, orders_of, orders_without
-from scanner.decode.middles import nth_of
+from scanner.decode.frame_orders import (
+    LEAST_SHARE,
+    LIT2,
+    MOST_SHIFTS,
+    NONE,
+    Order,
+    least_left,
+    left_beside_overtones,
+    orders_of,
+    orders_without,
+)
 from scanner.decode.pmp_frames import AxisFrames
 from scanner.decode.pmp_sample import Sample
-from scanner.kernel import kernel
-
-LEAST_SHARE = 0.06
-"""Of what a doubled neighbour leaves where all phases are seen, from where on frames are looked at and named. Less
-than that moves phases by .1 of a radian at the most with four shifts, .04 with eight, and counts no fringe wrong."""
 
 EXPLAINED = 0.35
 """Of what a set leaves beyond noise, at most, in an order that is believed; see `sequencer.witness_fringes`."""
@@ -45,9 +49,6 @@ should be it is 1 and noise on top; noise of B / 10 hides a doubled one of eight
 UNEXPLAINED = 0.5
 """Of what a doubled neighbour leaves, from where on a set that nothing explains is out of step, if others are not"""
 
-MOST_ALIKE = 0.5
-"""Mean vector of a set's phases, from where on it shows few of them: of phases within half a turn it is .64"""
-
 MEDIAN_SQUARE = 0.455
 """Of a normal variable's square, over its mean"""
 
@@ -56,11 +57,9 @@ LEAST_HEIGHT = 4.5
 
 MOST_PIXELS = 1024
 LEAST_PIXELS = 60
-THINNED = 8
-"""Of the scan's sample, what is asked whether frames need a look: a mean of five hundred is good to 5 %."""
-
-MOST_SHIFTS = 64
-"""Of a set that is looked at: one frame of more moves a phase by a hundredth of a cycle at the most."""
+MEANS_APART = 0.02
+"""Of B^2: mean square of what a set's mean light differs from the other sets' by. A doubled one of three frames makes
+it .17; the third overtone of an uncorrected gamma 2.3 less than .001."""
 
 FEWEST_LEFT = 4
 """Frames of a set, without false ones, from where on it is decoded without them: three would fit whatever they show"""
@@ -69,8 +68,6 @@ MOST_PAIRS = 3
 """Of doubled frames in one set, of which each combination is tried"""
 
 _TRIED = 12
-_LIT2 = 1 / 16
-"""Of the brightest pixels' height, squared"""
 
 
 @dataclass(frozen=True)
@@ -125,78 +122,6 @@ class Misplaced:
         return ", ".join(f"frame {n} shows {what}" for n, what in zip(false, named, strict=True))
 
 
-# --- whether to look ------------------------------------------------------------------------------------------------
-
-
-def may_be_doubled(frames: AxisFrames, sample: Sample, residual: NDArray[np.float32]) -> bool:
-    """Whether the sample's residuals are large enough for a look at the frames.
-
-    Args:
-        sample: without what overtones are of its residuals. residual: (R, L), with it.
-    """
-    if 3 in frames.shifts:
-        return True
-    tellable = [n for n in frames.shifts if 3 < n <= MOST_SHIFTS]
-    if not tellable:
-        return False
-    least = LEAST_SHARE * min(map(least_left, tellable))
-    return _stands_out(sample.modulations, sample.usable, residual, sample.residual, sample.phases, least, THINNED)
-
-
-@kernel
-def _stands_out(
-    modulations: NDArray[np.float32],
-    usable: NDArray[np.bool_],
-    residual: NDArray[np.float32],
-    without: NDArray[np.float32],
-    phases: NDArray[np.float32],
-    least: float,
-    every: int,
-) -> bool:
-    """Whether residuals are more than `least` of B^2: what overtones explain of them counts where a set shows so few
-    phases that one of its frames out of step would look like them."""
-    sets, length = modulations.shape[0], modulations.shape[2]
-    height2 = np.zeros((modulations.shape[1] + every - 1) // every * length, np.float32)
-    for r in range(0, modulations.shape[1], every):
-        for i in range(length):
-            if usable[r, i]:
-                for k in range(sets):
-                    b = modulations[k, r, i]
-                    height2[r // every * length + i] = max(height2[r // every * length + i], b * b)
-    lit = np.float32(_LIT2) * nth_of(height2, int(0.99 * (height2.size - 1)))
-    total, all_left, left = 0.0, 0.0, 0.0
-    for r in range(0, modulations.shape[1], every):
-        for i in range(length):
-            here = height2[r // every * length + i]
-            if here > lit:
-                total += here
-                all_left += residual[r, i]
-                left += without[r, i]
-    if all_left <= least * total:
-        return False
-    return left > least * total or _shows_few_phases(phases, height2, lit, every)
-
-
-@kernel
-def _shows_few_phases(phases: NDArray[np.float32], height2: NDArray[np.float32], lit: np.float32, every: int) -> bool:
-    """Whether one of the sets shows most of its lit pixels within a third of a turn or so."""
-    length = phases.shape[2]
-    for k in range(phases.shape[0]):
-        cosine, sine, count = 0.0, 0.0, 0
-        for r in range(0, phases.shape[1], every):
-            for i in range(length):
-                if height2[r // every * length + i] > lit:
-                    cosine += np.cos(2 * np.pi * phases[k, r, i])
-                    sine += np.sin(2 * np.pi * phases[k, r, i])
-                    count += 1
-        if cosine * cosine + sine * sine > (MOST_ALIKE * count) ** 2:
-            return True
-    return False
-
-
-# --- the look -------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Seen:
     """All frames of an axis at p lit pixels.
@@ -220,7 +145,7 @@ def misplaced_frames(frames: AxisFrames, sample: Sample) -> list[Misplaced]:
     found: list[Misplaced] = []
     for k, shifts in enumerate(frames.shifts):
         if shifts == 3:
-            found += _one_picture(k, seen)
+            found += _of_three(k, seen)
         elif k in verdicts:
             found += verdicts[k].found(min((v.noise for j, v in verdicts.items() if j != k), default=None))
     return found
@@ -232,7 +157,7 @@ def _lit_pixels(sample: Sample, frames: AxisFrames) -> NDArray[np.intp]:
     power = np.tensordot(counts, sample.modulations**2, 1) + sample.residual
     power[~sample.usable] = 0
     top = np.partition(power.reshape(-1), int(0.99 * (power.size - 1)))[int(0.99 * (power.size - 1))]
-    at = (sample.runs[:, None] + np.arange(power.shape[1]))[power > _LIT2 * top]
+    at = (sample.runs[:, None] + np.arange(power.shape[1]))[power > LIT2 * top]
     return np.asarray(at[:: max(-(-at.size // MOST_PIXELS), 1)])
 
 
@@ -248,13 +173,44 @@ def _read(frames: AxisFrames, at: NDArray[np.intp]) -> _Seen:
     return _Seen(tuple(samples), tuple(products), tuple(heights2))
 
 
-def _one_picture(k: int, seen: _Seen) -> list[Misplaced]:
-    """Of a set of three: two frames that are the same to the last bit."""
-    pairs = [(n, m) for n, m in combinations(range(3), 2) if np.array_equal(seen.samples[k][n], seen.samples[k][m])]
-    if not pairs:
+def _of_three(k: int, seen: _Seen) -> list[Misplaced]:
+    """Of a set of three: two frames that show the same, to the last bit or while its mean light is not that of others;
+    or one that shows what another set's frame does."""
+    own = seen.samples[k]
+    pairs = [(n, m) for n, m in combinations(range(3), 2) if np.array_equal(own[n], own[m])]
+    if not pairs and not _means_differ(k, seen):
         return []
-    n, m = pairs[0]
-    return [Misplaced(k, False, (Order.of(3, {n: m}), Order.of(3, {m: n})))]
+    most = ALIKE * seen.heights2[k]
+    pairs = pairs or [(n, m) for n, m in combinations(range(3), 2) if np.mean((own[n] - own[m]) ** 2) < most]
+    if pairs:
+        n, m = pairs[0]
+        return [Misplaced(k, False, (Order.of(3, {n: m}), Order.of(3, {m: n})))]
+    like = {n: source for n in range(3) if (source := _like(k, n, seen)) is not None}
+    return [Misplaced(k, False, (Order.of(3, {n: NONE}),), source) for n, source in like.items() if len(like) == 1]
+
+
+def _means_differ(k: int, seen: _Seen) -> bool:
+    """Whether a set's mean light differs from that of the others, but for lamps and noise."""
+    others = [samples.mean(axis=0) for j, samples in enumerate(seen.samples) if j != k and len(samples)]
+    if not others:
+        return False
+    own, light = seen.samples[k].mean(axis=0), np.median(others, axis=0)
+    own = own - float(own @ light) / max(float(light @ light), 1e-9) * light
+    noise = min(float(np.mean((a - b) ** 2)) for a, b in combinations(seen.samples[k], 2)) / 2
+    return bool(np.mean(own**2) > MEANS_APART * seen.heights2[k] + noise)
+
+
+def _like(k: int, n: int, seen: _Seen) -> tuple[int, int] | None:
+    """(set, frame) of another set that shows what frame n of this one does: differing fringes are B^2 apart."""
+    own = seen.samples[k][n]
+    apart = [
+        (float(np.mean((frame - own) ** 2)), (j, m))
+        for j, samples in enumerate(seen.samples)
+        for m, frame in enumerate(samples)
+        if j != k
+    ]
+    least, where = min(apart, default=(np.inf, (0, 0)))
+    return where if least < ALIKE * seen.heights2[k] else None
 
 
 class _Verdict:
@@ -327,7 +283,7 @@ class _Verdict:
             known = orders_without(self._shifts)
             left = [(order, left_beside_overtones(self._samples, order)) for order in known.orders]
             orders = self._best(before, left, self._freedom - 1)
-        like = {n: source for n in range(self._shifts) if (source := self._like(n)) is not None}
+        like = {n: source for n in range(self._shifts) if (source := _like(self._k, n, self._seen)) is not None}
         if not orders and len(like) == 1:
             orders = tuple(Order.of(self._shifts, {n: NONE}) for n in like)
         return orders, like.get(orders[0].false[0]) if len(orders) == 1 else None
@@ -357,18 +313,6 @@ class _Verdict:
         ways = product(*(((n, m), (m, n)) for n, m in pairs))
         orders = [Order.of(self._shifts, dict(way)) for way in ways]
         return self._best(before, [(o, left_beside_overtones(self._samples, o)) for o in orders], self._freedom)
-
-    def _like(self, n: int) -> tuple[int, int] | None:
-        """(set, frame) of another set that shows what frame n of this one does: differing fringes are B^2 apart."""
-        own = self._samples[n]
-        apart = [
-            (float(np.mean((frame - own) ** 2)), (j, m))
-            for j, samples in enumerate(self._seen.samples)
-            for m, frame in enumerate(samples)
-            if j != self._k
-        ]
-        least, where = min(apart, default=(np.inf, (0, 0)))
-        return where if least < ALIKE * self._seen.heights2[self._k] else None
 
     def _plain(self, orders: tuple[Order, ...]) -> bool:
         """Whether it is plain which frames are false, and enough are left."""

@@ -20,6 +20,16 @@ from numpy.typing import NDArray
 NONE = -1
 """In place of a shift: what the frame shows is none of its set's."""
 
+LEAST_SHARE = 0.06
+"""Of what a doubled neighbour leaves where all phases are seen, from where on frames are looked at and named. Less
+than that moves phases by .1 of a radian at the most with four shifts, .04 with eight, and counts no fringe wrong."""
+
+MOST_SHIFTS = 64
+"""Of a set that is looked at: one frame of more moves a phase by a hundredth of a cycle at the most."""
+
+LIT2 = 1 / 16
+"""Of the brightest pixels' height, squared"""
+
 ALL_UP_TO = 16
 """Shifts of a set for which every exchange is tried; of larger ones those no farther than NEAR apart, round the turn"""
 

@@ -17,8 +17,8 @@ from scanner.decode import Decoded, Map, Reason
 from scanner.decode.addresses import maps_to_fill
 from scanner.decode.agreement import Remainder, remainders
 from scanner.decode.cut_at_black import unmove_dark
-from scanner.decode.doubled import may_be_doubled
 from scanner.decode.field_end import far_rooms, margin_px
+from scanner.decode.frame_doubts import may_be_doubled
 from scanner.decode.neighbours import settle
 from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel
 from scanner.decode.one_surface import doubt_axis, doubtful_steps
@@ -225,7 +225,7 @@ def decode_axis(
         shared.open()
         # What a report tells is no business of the pass: others are in it by now.
         found = remainders(plan.ladder, judged.steps, judged.pixels)
-        doubled = may_be_doubled(frames, sample, residual)
+        doubled = may_be_doubled(frames, sample, residual, found)
         random_px, ripple, light = np.nan, None, Light((), None)
         if not brief:
             random_px = plan.per_cycle * judged.phase_sigma(finest)

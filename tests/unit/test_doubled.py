@@ -147,12 +147,15 @@ def test_what_else_leaves_residuals_is_not_taken_for_frames_out_of_step(kind):
         assert not [words for words in found.warnings if "capture again" in words]
 
 
-def test_of_four_shifts_both_are_named_and_of_three_those_that_are_one_picture():
-    for shifts in (3, 4):
-        sequence, frames, _ = captured(shifts)
-        frames[shifts + 1] = frames[shifts]
-        told = f"frequency 4 along y: frames {shifts} and {shifts + 1} show the same: the set is out of step"
-        assert decoded(sequence, frames).warnings[0].startswith(told)
+@pytest.mark.parametrize("k", [0, 1, 2])
+@pytest.mark.parametrize("fresh", [False, True])
+def test_of_three_shifts_the_mean_light_tells_a_doubled_frame(k, fresh):
+    sequence, frames, _ = captured(3)
+    frames[3 * k + 1] = captured(3, seed=1)[1][3 * k] if fresh else frames[3 * k]
+    found = decoded(sequence, frames)
+    told = f"frames {3 * k} and {3 * k + 1} show the same: the set is out of step; capture again"
+    assert found.warnings == (f"frequency {(1, 4, 16)[k]} along y: {told}",)
+    assert not np.isfinite(found.rows).any()
 
 
 @pytest.mark.parametrize(
