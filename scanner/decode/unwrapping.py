@@ -49,10 +49,18 @@ class Ladder:
     def warnings(self) -> tuple[str, ...]:
         """What a user should know about steps too wide for comfort."""
         return tuple(
-            f"frequency {high:g} is unwrapped by {low:g}: steps above {WIDE_STEP:g} to 1 cost coverage in noise"
+            f"frequency {high:g} is unwrapped by {low:g}, a step of {high / low:.3g} to 1: above {WIDE_STEP:g} to 1 "
+            "noise leaves it open in which fringe a pixel is, and where it does the pixel is undecided and has no "
+            f"point; add {_between(low, high)} to the frequencies, or take more shifts"
             for low, high in zip(self.frequencies[:-1], self.frequencies[1:], strict=True)
             if high / low > WIDE_STEP * (1 + _TOLERANCE)
         )
+
+
+def _between(low: float, high: float) -> str:
+    """Frequencies that cut a wide step into the fewest that are not, to two digits, in words."""
+    steps = max(2, int(np.ceil(np.log(high / low) / np.log(WIDE_STEP) - _TOLERANCE)))
+    return " and ".join(f"{float(f'{low * (high / low) ** (k / steps):.2g}'):g}" for k in range(1, steps))
 
 
 def plan_ladder(frequencies: Sequence[float], gains: Sequence[float]) -> Ladder:

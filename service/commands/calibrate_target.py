@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from service.commands.calibrate_solve import TARGET_HELP, Replace
 from service.commands.options import AsJson, output_path
-from service.terminal import print_facts, print_json
+from service.terminal import print_error, print_facts, print_json
+
+if TYPE_CHECKING:
+    from scanner.calibration.targets import Target
+
+LEAST_CONTRAST = 0.5
+"""Of black on white: a point is as unsure as contrast is small, and below 0.3 of it a ChArUco board loses markers at
+a quarter of full light; half leaves room for both"""
 
 
 def target(
@@ -52,15 +59,25 @@ def target(
     drawing = target_svg(chosen, grey)
     replace_file(output, drawing.text.encode())
     first, last = chosen.longest
-    facts = {
+    contrast = 1 - grey
+    facts: dict[str, Any] = {
         "file": str(output),
         "paper_mm": [round(drawing.width_mm, 3), round(drawing.height_mm, 3)],
         "page": drawing.page,
         "ruler_mm": drawing.ruler_mm,
         "length_mm": chosen.longest_mm,
     }
+    warnings = _of_grey(chosen, contrast)
     if as_json:
-        print_json({**facts, "points": len(chosen.points), "between": [first, last]})
+        print_json(
+            {
+                **facts,
+                "points": len(chosen.points),
+                "between": [first, last],
+                "contrast": round(contrast, 4),
+                "warnings": warnings,
+            }
+        )
         return 0
     print_facts(
         "target",
@@ -70,6 +87,32 @@ def target(
             ("print", "at 100 %, no fitting to the page"),
             ("check", f"the ruler must be {drawing.ruler_mm:g} mm long"),
             ("measure", f"first to last point of the longest row, nominally {chosen.longest_mm:g} mm (--length)"),
+            *([] if grey == 0 else [("contrast", _contrast(contrast))]),
         ],
     )
+    for said in warnings:
+        print_error(said, label="warning")
     return 0
+
+
+def _contrast(contrast: float) -> str:
+    return (
+        f"{contrast:.0%} of black on white: points in the camera are {1 / contrast:.1f} times as unsure, and fringes "
+        "show on the dark parts; printers make grey of dots: look whether edges are straight"
+    )
+
+
+def _of_grey(target: Target, contrast: float) -> list[str]:
+    """What a grey print is not good for."""
+    found = []
+    if contrast < LEAST_CONTRAST:
+        found.append(
+            f"dark parts of {1 - contrast:.0%} lightness leave {contrast:.0%} of the contrast: in poor light the "
+            "target is not found; --grey 0.35 shows fringes as well"
+        )
+    if target.kind == "charuco" and contrast < 1:
+        found.append(
+            "the markers are grey, too, and the first to be lost in poor light: a chessboard has none "
+            "(chessboard:COLUMNSxROWS:MM), and black ones (without --grey) are found best"
+        )
+    return found

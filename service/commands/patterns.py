@@ -15,7 +15,7 @@ from service.commands.options import (
     output_path,
 )
 from service.commands.pattern_options import UNSAID, takes_pattern
-from service.terminal import print_facts, print_json, progress_lines
+from service.terminal import print_error, print_facts, print_json, progress_lines
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -79,6 +79,7 @@ def patterns(
         known = _of_size(size or DEFAULT_SIZE) if rig is None else known_rig(rig)
         sequence = _sequence(method, members, known, gamma, bracketed=bracketed)
         why = {} if rig is None else _reasons(known, method, members, gamma)
+        warnings = _warnings(sequence)
     except ScannerError as error:
         raise typer.BadParameter(f"{error}{f' ({error.hint})' if error.hint else ''}") from error
     prepare_output(output, force=force)
@@ -98,11 +99,23 @@ def patterns(
         }
         replace_json(output / PATTERN_FILE, content)
     if as_json:
-        print_json({"folder": str(output), **content, "why": why})
+        print_json({"folder": str(output), **content, "why": why, "warnings": list(warnings)})
     else:
         facts = [("images", len(names)), ("description", output / PATTERN_FILE), *why.items()]
         print_facts("patterns", facts)
+    for said in warnings:
+        print_error(said, label="warning")
     return 0
+
+
+def _warnings(sequence: PatternSequence) -> tuple[str, ...]:
+    """What the decoder will say of these images whatever they show: steps of frequencies that are too wide."""
+    from scanner.decode.unwrapping import plan_ladder  # noqa: PLC0415
+    from scanner.patterns import PmpPattern  # noqa: PLC0415
+
+    if not isinstance(sequence.pattern, PmpPattern):
+        return ()
+    return plan_ladder(sequence.pattern.frequencies, [2 / n for n in sequence.pattern.shifts]).warnings()
 
 
 def _of_size(text: str) -> KnownRig:

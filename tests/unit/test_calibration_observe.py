@@ -297,5 +297,14 @@ def test_command_draws_a_target(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert document["paper_mm"] == [330.0, 262.0]
     assert document["length_mm"] == 240.0
     assert file.read_text().startswith("<?xml")
+    assert (document["contrast"], document["warnings"]) == (1.0, [])
+    words = ["calibrate", "target", "--grey", "0.6", "-o", str(file), "--force"]
+    assert main([*words, "charuco:10x7:30"]) == 0
+    shown = capsys.readouterr()
+    assert "40% of black on white: points in the camera are 2.5 times as unsure" in " ".join(shown.out.split())
+    assert "leave 40% of the contrast" in shown.err
+    assert "the markers are grey, too" in shown.err
+    assert main([*words[:3], "0.35", *words[4:], "chessboard:9x6:30"]) == 0
+    assert "warning" not in capsys.readouterr().err
     assert main(["calibrate", "target", "chessboard:9x6:30", "-o", str(tmp_path / "board.pdf")]) == 2
     assert main(["calibrate", "target", "chessboard:9x6:30", "-o", str(file)]) == 2

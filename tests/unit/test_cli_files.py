@@ -67,6 +67,7 @@ def capture_of(folder: Path, **changes: Any) -> Path:
         ["gray", "--no-inverse", "--code", "binary", "--axis", "x"],
         ["gray+pmp", "--inverse", "--bracketed"],
         ["pmp", "--bracketed", "--gamma", "2.2"],
+        ["pmp", "--frequencies", "1,20", "--shifts", "4"],
     ],
 )
 def test_patterns_are_what_their_description_says(words: list[str], run: Run, tmp_path: Path) -> None:
@@ -75,6 +76,7 @@ def test_patterns_are_what_their_description_says(words: list[str], run: Run, tm
     assert status == 0
     content = json.loads((tmp_path / "images" / "pattern.json").read_text())
     assert {key: json.loads(out)[key] for key in content} == content
+    assert len(json.loads(out)["warnings"]) == ("1,20" in words), "a step that the decoder will warn of is warned of"
     assert (content["format"], content["version"]) == ("fringed-pattern", 1)
     projector = ProjectorSize(**content["projector"])
     sequence = PatternSequence.from_description(projector, content["pattern"])

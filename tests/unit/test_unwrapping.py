@@ -66,7 +66,10 @@ def test_frequencies_that_leave_two_places_alike_are_refused(frequencies):
 def test_wide_steps_are_warned_of():
     assert plan_ladder([1, 16], [0.5, 0.5]).warnings() == ()
     (warning,) = plan_ladder([1, 17], [0.5, 0.5]).warnings()
-    assert "17 is unwrapped by 1" in warning
+    assert "17 is unwrapped by 1, a step of 17 to 1" in warning
+    assert "add 4.1 to the frequencies" in warning
+    (warning,) = plan_ladder([1, 400], [0.5, 0.5]).warnings()
+    assert "add 7.4 and 54 to the frequencies" in warning
 
 
 def test_the_less_noisy_way_is_taken():
