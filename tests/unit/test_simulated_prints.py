@@ -1,4 +1,4 @@
-"""Prints: what a camera pixel sees of them is the mean over its footprint, against a million samples by NumPy."""
+"""Prints: what a camera pixel sees of them is the mean over its footprint, against forty thousand samples by NumPy."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from drivers.simulated import coverage, targets
 
-SAMPLES = 400
+SAMPLES = 200
 S, T = np.meshgrid(*(2 * [(np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5]))
 
 
@@ -38,7 +38,7 @@ def test_a_rasters_mean_over_a_footprint_is_exact(tiled: bool) -> None:
 def test_a_discs_share_of_a_footprint_is_exact() -> None:
     for (u, v, ax, ay, bx, by), radius in zip(footprints(24), np.resize([0.3, 2.0, 5.0], 27), strict=True):
         inside = (u + S * ax + T * bx) ** 2 + (v + S * ay + T * by) ** 2 < radius**2
-        assert coverage.disc_share(u, v, ax, ay, bx, by, radius) == pytest.approx(inside.mean(), abs=1e-4)
+        assert coverage.disc_share(u, v, ax, ay, bx, by, radius) == pytest.approx(inside.mean(), abs=5e-4)
 
 
 def test_the_charuco_print_is_the_board_that_opencv_draws() -> None:
