@@ -2,8 +2,8 @@
 
 The position is the centre of the cell that the projected bits name (formats.md). A pixel on the border of two cells
 leaves one bit open, blur one or two; where all that they could mean are cells close by, the position is the middle of
-these, and its sigma as wide as they are. Everywhere else an open bit leaves the pixel undecided. Frames are kept and
-decoded in one pass over all of them.
+these, and its sigma what their borders leave (`graycode_cells`). Everywhere else an open bit leaves the pixel
+undecided. Frames are kept and decoded in one pass over all of them.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from scanner.decode.code_end import between_ends, beyond_ends
 from scanner.decode.frames import FrameCheck
 from scanner.decode.graycode_bits import BOTH, INVERSE, PLAIN
 from scanner.decode.graycode_blur import blurred_bits, share_to_count, shares_decided
+from scanner.decode.graycode_cells import narrow_cells
 from scanner.decode.graycode_noise import noise_factor
 from scanner.decode.graycode_strips import decode_code_strips
 from scanner.decode.noise import ROUNDING_VARIANCE, default_noise
@@ -262,6 +263,9 @@ class GrayDecoder:
             shared.open()
             counts = shared.finish()
         shares = shares_decided(counts[REASONS:], codes.kinds.shape)
+        for index, axis in enumerate(() if brief else pattern.axes):
+            sigma, along = self._maps[len(pattern.axes) + index], self._sequence.projector.along(axis)
+            narrow_cells(sigma, self._maps[index], along, self._cell_px, self._camera.width)
         self._leave_ends_out(codes, counts)
         return counts[:REASONS], factor, (*warnings, *blurred_bits(pattern, shares))
 

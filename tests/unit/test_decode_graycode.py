@@ -156,7 +156,8 @@ def test_the_border_of_two_cells_is_decided_and_nothing_else_is_between():
     assert np.isfinite(found.columns).mean() > 0.99
     # A cell is two pixels wide: those between two cells see the border, and all others the middle of theirs.
     np.testing.assert_allclose(found.columns, at + 0.5, atol=1e-4)
-    assert np.nanmax(found.sigma_columns) > 2 / np.sqrt(12)
+    # As many pixels lie on borders as in cells: either is half a cell wide, a little ragged.
+    np.testing.assert_allclose(found.sigma_columns[:, 2:-2], 1 / np.sqrt(12), rtol=0.15)
 
 
 def blurred(sequence, sigma_px, pixels=4000):
