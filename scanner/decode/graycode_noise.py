@@ -72,21 +72,28 @@ def noise_factor(
         lit += 1 if white[i] - black[i] > least and white[i] < noise[4] else 0
     if lit < FEWEST:
         return lit, max(dark, 1.0)
-    here = here[:lit]
+    _keep_those(here[:lit], image, inverse, white, black)
+    white, black = white[:lit], black[:lit]
     ratios, quiet = np.empty(bits * lit, np.float32), np.empty(bits * lit, np.float32)
     # Where black cuts depends on the noise: at first that of the model, then what the others show if it is more. The
     # last round takes all, where black cuts all.
     factor = 1.0
     for turn in range(3):
         limit = np.float32(CUT_SIGMAS**2 * max(factor, dark, 1.0)) if turn < 2 else np.float32(0)
-        count = 0
-        for bit in range(bits):
-            count += _ratios(
-                image[bit], inverse[bit], white, black, kinds[bit], levels[0] != 0, here, noise, limit,
-                ratios[count:], quiet[count:],
-            )  # fmt: skip
+        count, middle = 0, 0.0
+        if np.all(kinds == BOTH) and not _any_cut(image, inverse, black, noise, limit):
+            middle = _ratios_of_pairs(image, inverse, white, black, levels[0] != 0, noise, ratios, quiet[:lit])
+            count = ratios.size
+        else:
+            for bit in range(bits):
+                count += _ratios(
+                    image[bit], inverse[bit], white, black, kinds[bit], levels[0] != 0, noise, limit,
+                    ratios[count:], quiet[count:],
+                )  # fmt: skip
+            if count > 0:
+                middle = float(nth_of(quiet[:count], count // 2))
         if count >= FEWEST:
-            seen = _mean_square(ratios[:count], float(nth_of(quiet[:count], count // 2)))
+            seen = _mean_square(ratios[:count], middle)
             factor = seen if turn < 2 else max(factor, seen)
             if turn == 1 or factor <= max(dark, 1.0):
                 break
@@ -172,6 +179,72 @@ def _levels_of_pairs(
 
 
 @kernel
+def _keep_those(
+    here: NDArray[np.int64],
+    image: NDArray[np.float32],
+    inverse: NDArray[np.float32],
+    white: NDArray[np.float32],
+    black: NDArray[np.float32],
+) -> None:
+    """Put pixels that are here, in their order, before all others."""
+    if here.size == white.size:
+        return
+    for n in range(here.size):
+        white[n], black[n] = white[here[n]], black[here[n]]
+    for bit in range(image.shape[0]):
+        for n in range(here.size):
+            image[bit, n], inverse[bit, n] = image[bit, here[n]], inverse[bit, here[n]]
+
+
+@kernel
+def _any_cut(
+    image: NDArray[np.float32],
+    inverse: NDArray[np.float32],
+    black: NDArray[np.float32],
+    noise: NDArray[np.float32],
+    limit: np.float32,
+) -> bool:
+    """Whether `_ratios` would leave any of pairs out."""
+    v0, slope, least, cut = noise[0], noise[1], noise[2], 0
+    for bit in range(image.shape[0]):
+        one, two = image[bit], inverse[bit]
+        for i in range(black.size):
+            seen = (min(one[i], two[i]) + black[i]) * _HALF
+            cut += 1 if seen * seen < limit * max(v0 + slope * seen, least) else 0
+    return cut > 0
+
+
+@kernel
+def _ratios_of_pairs(
+    image: NDArray[np.float32],
+    inverse: NDArray[np.float32],
+    white: NDArray[np.float32],
+    black: NDArray[np.float32],
+    has_levels: bool,
+    noise: NDArray[np.float32],
+    out: NDArray[np.float32],
+    quiet: NDArray[np.float32],
+) -> float:
+    """`_ratios` of all bits where all are pairs and none is left out, in simple loops. quiet: (lit,), to work in.
+
+    Returns:
+        The median of the least they could be. A pixel's is the same in all bits.
+    """
+    of_pairs, bits, lit = np.float32(4 if has_levels else 3), image.shape[0], white.size
+    v0, slope, least = noise[0], noise[1], noise[2]
+    for i in range(lit):
+        quiet[i] = max(v0 + slope * ((white[i] + black[i]) * _HALF), least)
+    for bit in range(bits):
+        one, two, row = image[bit], inverse[bit], out[bit * lit : (bit + 1) * lit]
+        for i in range(lit):
+            off = one[i] + two[i] - (white[i] + black[i])
+            row[i] = off * off / (of_pairs * quiet[i])
+    for i in range(lit):
+        quiet[i] = least / quiet[i]
+    return float(nth_of(quiet, bits * lit // 2 // bits))
+
+
+@kernel
 def _ratios(
     image: NDArray[np.float32],
     inverse: NDArray[np.float32],
@@ -179,7 +252,6 @@ def _ratios(
     black: NDArray[np.float32],
     kind: int,
     has_levels: bool,
-    here: NDArray[np.int64],
     noise: NDArray[np.float32],
     limit: np.float32,
     out: NDArray[np.float32],
@@ -194,8 +266,7 @@ def _ratios(
     """
     of_pairs = np.float32(4 if has_levels else 3)
     count = 0
-    for n in range(here.size):
-        i = here[n]
+    for i in range(white.size):
         light, dark = white[i], black[i]
         # A level's two samples together say how bright it is, and nothing of their difference.
         if kind == BOTH:

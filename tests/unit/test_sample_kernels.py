@@ -21,7 +21,7 @@ def numbers(size, seed=0, steps=24):
     return (np.rint(drawn * steps) / steps).astype(np.float32)
 
 
-@pytest.mark.parametrize("size", [33, 4096, 5001])
+@pytest.mark.parametrize("size", [70001, 33, 4096, 5001])
 def test_numbers_come_in_their_order_and_equal_ones_as_they_were(size):
     keys = numbers(size)
     order = order_of(keys)
