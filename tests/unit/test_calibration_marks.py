@@ -146,6 +146,7 @@ def test_a_knock_shows_across_the_epipolar_lines_and_a_pitch_does_not() -> None:
     assert knocked is not None
     assert abs(knocked.median_px) == pytest.approx(0.4, rel=0.1)
     assert "0.4" in str(knocked.warning)
+    assert "or the calibration is another rig's" in str(knocked.warning), "one scan does not tell which"
     assert knocked.depth_mm == pytest.approx(0.4 * 700**2 / 220 / 1500, rel=0.3)
     along = drift_of(rig, rows, columns + np.float32(0.4), points)
     assert along is not None

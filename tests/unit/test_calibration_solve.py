@@ -313,10 +313,10 @@ def test_target_that_did_not_move_is_named() -> None:
 
 
 def test_poses_without_depth_or_tilt_are_refused() -> None:
-    flat = poses(8, tilt_deg=0.0, depth=(700.0, 700.0))
+    flat = poses(5, tilt_deg=0.0, depth=(700.0, 700.0))
     flat[:, :2] = 0.0
     with pytest.raises(CalibrationError) as refused:
-        calibrate(TARGET, observations(RIG, flat), LENGTH)
+        calibrate(SMALL, observations(RIG, flat, target=SMALL), SMALL_LENGTH)
     assert "tilt" in str(refused.value.hint) or "plane" in str(refused.value)
 
 

@@ -258,12 +258,14 @@ def test_verify_takes_the_calibration_that_made_the_scan_and_no_other(tmp_path, 
     # U contains the calibration: only the others are said to be in none of the figures.
     assert "at least +-0.032 mm of depth (k = 2) besides the calibration, and what is unknown (sync); in none" in said
     save(tmp_path / "b", *ball(), "another")
-    without, other = tmp_path / "without.json", tmp_path / "other.json"
+    without, other, true = (tmp_path / f"{name}.json" for name in ("without", "other", "true"))
     without.write_text(json.dumps(rig(covariance=None)))
+    true.write_text(json.dumps(rig(covariance=None, id="simulated-casey2011")))
     other.write_text(json.dumps(rig(translation=[0, 140, 0])))
     for options, why in (
         ([], "no calibration of the name that its report has"),
-        (["--calibration", str(without)], "the calibration has no covariance"),
+        (["--calibration", str(without)], "the calibration has no covariance;"),
+        (["--calibration", str(true)], "the calibration has no covariance (the true one of a simulated rig);"),
         (["--calibration", str(other)], "were not made by calibration made up"),
     ):
         assert main(["calibrate", "verify", str(tmp_path / "b"), "--sphere", "119.5", *options]) == 0
