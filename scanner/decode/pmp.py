@@ -36,6 +36,7 @@ from scanner.decode.lone_set import require_fringes
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps, undecided
 from scanner.decode.pmp_frames import axis_frames
 from scanner.decode.pmp_plan import plan_axis, whole_sets
+from scanner.decode.rotated import cannot_reveal, out_of_step, rotated_sets
 from scanner.decode.strips import threads_to_use
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
@@ -189,7 +190,11 @@ class PmpDecoder:
         found = self._decoded_axis(axis, brief)
         faults = self._misplaced(axis, found)
         if all(fault.mended for fault in faults):
-            return self._decoded_axis(axis, brief) if faults else found
+            found = self._decoded_axis(axis, brief) if faults else found
+            frequencies, shifts = self._pattern.frequencies, self._pattern.shifts
+            if not (rotated := rotated_sets(found.ladder, found.remainders, shifts)):
+                return found
+            self._doubled += out_of_step(axis, rotated, frequencies, shifts)
         self._ends[axis] = None
         return undecided(found)
 
@@ -250,6 +255,7 @@ class PmpDecoder:
                 }
                 for axis, found in self._found.items()
             },
+            "cannot_reveal": list(cannot_reveal(self._pattern.frequencies, self._pattern.shifts)),
             "light": {axis: found.light.as_dict() for axis, found in self._found.items()},
             "field_end": {axis: end.as_dict() for axis, end in self._ends.items() if end is not None},
         }

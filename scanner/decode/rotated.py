@@ -1,0 +1,132 @@
+"""Sets of fringes that are out of step as a whole: each of their frames shows the next shift, or one farther on.
+
+Such a set fits its fringe without a rest; its phase is off by so many shifts at every pixel. What steps between
+frequencies leave is then off by the same at every pixel, too, and tells which set it may be, unless the error is whole
+fringes in every step: that only an absolute witness sees (the sequencer's order bars), and `cannot_reveal` says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.decode.agreement import Remainder
+from scanner.decode.sample_kernels import MIN_PIXELS
+from scanner.decode.unwrapping import Ladder, plan_ladder
+
+LEAST_OFFSET = 0.045
+"""Of a fringe, mean of what a step leaves, from where on a set may be out of step: one of 16 shifts makes .0625. Other
+causes leave .015 at the most in simulated scenes, with 3 % of flicker .025 where sets have four shifts or more."""
+
+MOST_APART = 0.02
+"""Of a fringe, from what a rotation leaves of any step"""
+
+LEAST_AGREEMENT = 0.93
+"""Of the pixels' remainders, over what noise leaves of it: a rotation is the same at all of them, and light that
+surfaces throw at one another is not."""
+
+
+@dataclass(frozen=True)
+class Rotated:
+    """by: shifts that a set is off, in the sense of its phase; of_set: its number, or None: all sets by as many."""
+
+    of_set: int | None
+    by: int
+
+    def says(self, frequencies: Sequence[float], shifts: Sequence[int]) -> str:
+        """In words."""
+        if self.of_set is None:
+            return "every frequency by one shift"
+        count, n = shifts[self.of_set], min(self.by, shifts[self.of_set] - self.by)
+        return f"frequency {frequencies[self.of_set]:g} by {n} of its {count} shifts"
+
+
+def rotated_sets(ladder: Ladder, steps: Sequence[Remainder], shifts: Sequence[int]) -> tuple[Rotated, ...]:
+    """Rotations that explain what every step leaves, where that is more than other causes make; any one of them.
+
+    Args:
+        steps: of the ladder. shifts: by set, of the pattern.
+    """
+    if all(abs(s.offset) < LEAST_OFFSET for s in steps) or not all(map(_alike_everywhere, steps)):
+        return ()
+    seen = np.array([s.offset for s in steps])
+    return tuple(
+        rotated
+        for rotated in _rotations(shifts)
+        if np.abs(_folded(_left(ladder, _turns(rotated, shifts)) - seen)).max() < MOST_APART
+    )
+
+
+def out_of_step(
+    axis: str, rotated: Sequence[Rotated], frequencies: Sequence[float], shifts: Sequence[int]
+) -> tuple[str, ...]:
+    """What a user should know of `rotated_sets`."""
+    if not rotated:
+        return ()
+    named = dict.fromkeys(one.says(frequencies, shifts) for one in rotated)
+    return (
+        f"along {axis} frequencies differ by the same part of a fringe at every pixel: {' or '.join(named)} out of "
+        "step; capture again",
+    )
+
+
+@lru_cache(maxsize=32)
+def cannot_reveal(frequencies: tuple[float, ...], shifts: tuple[int, ...]) -> tuple[str, ...]:
+    """Faults of order that frames of these sets would not show, for a report."""
+    ladder = plan_ladder(frequencies, [2 / n for n in shifts])
+    found = []
+    for k, (frequency, count) in enumerate(zip(frequencies, shifts, strict=True)):
+        hidden = [n for n in range(1, count) if _is_hidden(ladder, Rotated(k, n), shifts)]
+        if hidden:
+            turns = ", ".join(map(str, hidden))
+            found.append(f"frequency {frequency:g} shown {turns} of its {count} shifts late or early as a whole")
+    if {3, 4} & set(shifts):
+        found.append(
+            "two frames of three shifts exchanged, or of four half a turn apart, where steps do not contradict"
+        )
+    return tuple(found)
+
+
+def _is_hidden(ladder: Ladder, rotated: Rotated, shifts: Sequence[int]) -> bool:
+    return bool(np.abs(_left(ladder, _turns(rotated, shifts))).max(initial=0.0) < LEAST_OFFSET)
+
+
+def _alike_everywhere(step: Remainder) -> bool:
+    # Mardia 1972, sec. 3.4: of normal errors of sigma s the mean vector is e^(-s^2 / 2) long.
+    by_noise = float(np.exp(-((2 * np.pi * step.expected_sigma) ** 2) / 2))
+    return step.pixels >= MIN_PIXELS and step.agreement >= LEAST_AGREEMENT * by_noise
+
+
+def _rotations(shifts: Sequence[int]) -> Iterator[Rotated]:
+    for k, count in enumerate(shifts):
+        yield from (Rotated(k, n) for n in range(1, count))
+    for n in (1, -1):
+        yield Rotated(None, n)
+
+
+def _turns(rotated: Rotated, shifts: Sequence[int]) -> NDArray[np.float64]:
+    """(K,) cycles that the sets' phases are off."""
+    turns = np.zeros(len(shifts))
+    for k, count in enumerate(shifts):
+        if rotated.of_set in (k, None):
+            turns[k] = rotated.by / count
+    return turns
+
+
+def _left(ladder: Ladder, turns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(J - 1,) what every step leaves, cycles within half a one, where phases are off by `turns` and nothing else."""
+    beats = _folded(ladder.combinations @ turns)
+    off, left = float(beats[0]), []
+    for ratio, beat in zip(ladder.ratios.tolist(), beats[1:].tolist(), strict=True):
+        order = round(ratio * off - beat)
+        left.append(ratio * off - beat - order)
+        off = beat + order
+    return np.array(left)
+
+
+def _folded(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(cycles - np.rint(cycles))
