@@ -99,8 +99,17 @@ class Budget:
         """Of all known ones."""
         return math.hypot(self.of("random"), self.of("systematic"))
 
+    @property
+    def dominant(self) -> tuple[str, float] | None:
+        """The largest known one of the median point, and its share of the variance; None where none is known."""
+        largest = max(self.contributions, key=lambda c: c.mm or 0.0, default=None)
+        if largest is None or not largest.mm:
+            return None
+        return largest.name, (largest.mm / self.combined_mm) ** 2
+
     def as_dict(self) -> dict[str, Any]:
         """For report.json."""
+        dominant = self.dominant
         return {
             "depth_mm": self.depth_mm,
             "contributions": [asdict(c) for c in self.contributions],
@@ -110,6 +119,7 @@ class Budget:
             "expanded_mm": COVERAGE_FACTOR * self.combined_mm,
             "coverage_factor": COVERAGE_FACTOR,
             "within_mm": self.within_mm,
+            "dominant": None if dominant is None else {"name": dominant[0], "share": dominant[1]},
             "unknown": list(self.unknown),
             "stated_length": self._of_stated(),
         }
@@ -123,12 +133,12 @@ class Budget:
 _CROSS_TALK = Contribution(
     "method", "systematic", None, None, "cross-talk of the channels: centimetres (Casey 2011, table 5.6)"
 )
-_BETWEEN_STRIPES = Contribution(
-    "method", "systematic", None, None,
-    "one frame measures along its stripes: between them the surface is drawn through, and where it bends or steps "
-    "there, or a stripe has a wrong name, errors are many times larger",
+_PRINT = Contribution(
+    "print", "systematic", None, None,
+    "print on the surface pulls stripes aside, and a stripe may have a wrong name: no sigma contains either; relief "
+    "between the stripes and edges are in the points' sigmas",
 )  # fmt: skip
-_METHODS = {CompositePattern: _CROSS_TALK, McpPattern: _BETWEEN_STRIPES}
+_METHODS = {CompositePattern: _CROSS_TALK, McpPattern: _PRINT}
 """What no sigma of a point contains"""
 
 

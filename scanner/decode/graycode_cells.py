@@ -51,7 +51,8 @@ def shares(odd: float, even: float, inside: float) -> tuple[np.float32, np.float
     left, aside, ragged = 1 - (first + second) / 2, (first - second) / 4, RAGGED * RAGGED * (first**2 + second**2) / 2
     # A strip that is wider on one side leaves a rest that is off the middle: its spread about the cell's middle.
     of_inside = math.sqrt(left * left + 12 * (aside * aside + ragged))
-    return np.float32(min(of_inside, 1.0)), np.float32(max(first, second) * math.sqrt(1 + 12 * RAGGED * RAGGED))
+    of_border = max(first, second) * math.sqrt(1 + 12 * RAGGED * RAGGED)
+    return np.float32(min(of_inside, 1.0)), np.float32(min(of_border, 2.0))
 
 
 @kernel

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.special import stdtrit
 
 from scanner.decode import Decoded, Map, Reason
 from scanner.decode.field_end import keep_pull
@@ -28,6 +29,9 @@ sigma at R = 2, JCGM 100:2008 table E.1, and the median over an image is far bet
 CONTRADICTING = 5.0
 """Scatter of one pixel above so many times its stated sigma is no noise either: of normal noise a pixel of two million
 has it at R = 2, and fewer with more repetitions."""
+
+COVERED = 0.97725
+"""Of normal errors, those below two sigmas"""
 
 CLASSES, FEWEST_OF_CLASS = 10, 100
 """Of pixels, by stated sigma, that say whether scatter grows with it; and how many each must have, for a median that is
@@ -207,7 +211,8 @@ class _AxisSums:
         stated = np.sqrt((self.count[here] if quantised else np.float32(1)) / self.weight[here])
         sigmas[here] = stated * self._widening(here)
         if unsteady is not None:
-            common = np.float32(unsteady.common_px) / np.sqrt(self.count[here].astype(np.float32))
+            n = self.count[here]
+            common = np.float32(unsteady.common_px) * _for_few(n) / np.sqrt(n.astype(np.float32))
             wide = np.hypot(stated * np.float32(unsteady.factor), common)
             sigmas[here] = np.maximum(sigmas[here], wide)
         return values, sigmas
@@ -253,6 +258,15 @@ def _parts(variance: Map, stated: Map) -> tuple[float, float]:
     terms = np.column_stack((believed, np.ones_like(believed))) / scale[:, None]
     (more, alike), _ = nnls(terms, (seen - believed) / scale)
     return float(np.sqrt(alike)), float(np.sqrt(1 + more))
+
+
+def _for_few(repetitions: NDArray[np.uint16]) -> Map:
+    """Student's factor over that of a normal error, for 95.45 of 100 (JCGM 100:2008, G.3): what is common to a
+    repetition is told by R - 1 freedoms, and twice its sigma is to cover it. 7.0, 2.3, 1.7 for R = 2, 3, 4."""
+    known = np.arange(int(repetitions.max(initial=2)) + 1)
+    factors = stdtrit(np.maximum(known - 1, 1), COVERED) / stdtrit(np.inf, COVERED)
+    found: Map = factors.astype(np.float32)[repetitions]
+    return found
 
 
 def _unsteady(scatter: Scatter | None) -> Scatter | None:

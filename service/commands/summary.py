@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -147,8 +148,16 @@ def _uncertainty(budget: Mapping[str, Any]) -> tuple[str, str] | None:
             "median point); the method's own error is not known and larger: see docs/explanation/uncertainty.md"
         )
     else:
-        text = (
-            f"+-{within} mm {at}, of 95 in 100 points: +-{random} mm random (the median point) and "
-            f"+-{alone(2 * budget['systematic_mm'])} mm systematic (both k = 2)"
-        )
+        text = f"+-{within} mm {at}, of 95 in 100 points; {_of_median(budget)}"
     return "uncertainty", f"{text}{f'; unknown, and not in it: {unknown}' if unknown else ''}"
+
+
+def _of_median(budget: Mapping[str, Any]) -> str:
+    """The median point's figure and its parts, whose squares add up to its square: k = 2 all of them.
+
+    A kind of which nothing is known has no part, not one of 0.
+    """
+    parts = {kind: 2 * budget[f"{kind}_mm"] for kind in ("random", "systematic") if budget[f"{kind}_mm"]}
+    words = [f"+-{alone(part)} mm {kind}" for kind, part in parts.items()]
+    words += [f"mostly {dominant['name']}"] if (dominant := budget.get("dominant")) else []
+    return f"the median one +-{alone(math.hypot(*parts.values()))} mm: {', '.join(words)} (k = 2)"

@@ -72,9 +72,20 @@ def test_a_scene_that_moved_is_said():
     random = np.random.default_rng(3)
     mean = mean_of([decoding(random, offset=0.5 * n) for n in range(4)])
     assert "moved or the light changed" in mean.warnings[0]
-    # Four at 0, .5, 1 and 1.5: their standard deviation over the root of four is what the mean is good for.
-    assert np.median(mean.sigma_rows) == pytest.approx(np.hypot(np.std([0, 0.5, 1, 1.5], ddof=1), SIGMA) / 2, rel=0.15)
+    # Four at 0, .5, 1 and 1.5: their standard deviation over the root of four, and Student's factor for so few.
+    common = 1.653 * np.std([0, 0.5, 1, 1.5], ddof=1)
+    assert np.median(mean.sigma_rows) == pytest.approx(np.hypot(common, SIGMA) / 2, rel=0.15)
     assert mean.sigma_rows.min() > 3 * SIGMA / 2
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_two_sigmas_of_few_repetitions_that_moved_cover_the_truth(count):
+    random, covered = np.random.default_rng(7), []
+    truth = np.linspace(100, 160, SHAPE[0] * SHAPE[1]).reshape(SHAPE)
+    for _ in range(100):
+        mean = mean_of([decoding(random, offset=random.normal(0, 2)) for _ in range(count)])
+        covered.append(np.abs(np.median(mean.rows - truth)) < 2 * np.median(mean.sigma_rows))
+    assert 0.9 <= np.mean(covered) <= 0.99
 
 
 def test_what_moved_all_pixels_alike_does_not_multiply_their_noise():
@@ -87,7 +98,7 @@ def test_what_moved_all_pixels_alike_does_not_multiply_their_noise():
             rows = np.linspace(100, 160, stated.size).reshape(SHAPE) + offset + noise * random.normal(0, stated)
             decodings.append(replace(one, rows=rows.astype(np.float32), sigma_rows=stated.astype(np.float32)))
         mean = mean_of(decodings)
-        common = np.std(offsets, ddof=1)
+        common = 1.215 * np.std(offsets, ddof=1)  # Student's factor for eight
         wanted = np.sqrt((noise * stated) ** 2 + common**2) / np.sqrt(8)
         quiet, noisy = stated < np.median(stated), stated > np.quantile(stated, 0.9)
         for part in (quiet, noisy):

@@ -39,6 +39,7 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
             "depth_mm": 700.2,
             "random_mm": 0.07,
             "systematic_mm": 0.0169,
+            "dominant": {"name": "noise", "share": 0.95},
             "unknown": ["calibration"],
             "stated_length": {"reference_mm": 240.0, "sigma_mm": 0.05, "share": 0.97},
         },
@@ -57,7 +58,7 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "(7 px and more from edges)" in printed
     assert "0.683 mm rms, 0.400 mm in 99 of 100 points (all that is lit, edges too, 0.12% of them wrong)" in printed
     assert "+-0.16 mm at 700 mm, of 95 in 100 points" in printed
-    assert "+-0.14 mm random (the median point) and +-0.034 mm systematic (both k = 2)" in printed
+    assert "the median one +-0.14 mm: +-0.14 mm random, +-0.034 mm systematic, mostly noise (k = 2)" in printed
     assert "unknown, and not in it: calibration" in printed
     assert "0 points off by half a fringe or stripe, or by 20 mm; 12 with those at edges" in printed
 
@@ -92,6 +93,13 @@ def test_what_a_method_adds_unknown_gets_no_figure_of_the_whole(
     assert "+-0.14 mm is the random part alone (k = 2, the median point)" in printed
     assert "the method's own error is not known and larger: see docs/explanation/uncertainty.md" in printed
     assert "unknown, and not in it: calibration, method" in printed
+    budget["unknown"] = ["calibration", "print"]
+    (tmp_path / "report.json").write_text(json.dumps(report), encoding="utf-8")
+    report_result(tmp_path, 1.0, {}, as_json=False)
+    printed = capsys.readouterr().out
+    assert "+-0.20 mm at 700 mm, of 95 in 100 points; the median one +-0.14 mm: +-0.14 mm random (k = 2); " in printed
+    assert "unknown, and not in it: calibration, print" in printed
+    assert "systematic" not in printed, "nothing is known of it: that is no 0"
 
 
 @pytest.mark.parametrize(("share", "said"), [(0.982, "98.2%"), (0.0006, "0.1%"), (0.0004, None), (0.0, None)])

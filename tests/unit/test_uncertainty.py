@@ -123,6 +123,10 @@ def test_sums_are_those_of_what_is_known(scene):
     assert told["systematic_mm"] == pytest.approx(systematic)
     assert told["random_mm"] == pytest.approx(by_name["noise"]["mm"])
     assert told["expanded_mm"] == pytest.approx(2 * np.hypot(told["random_mm"], systematic))
+    assert told["combined_mm"] ** 2 == pytest.approx(sum(c["mm"] ** 2 for c in told["contributions"]))
+    largest = max(told["contributions"], key=lambda c: c["mm"])
+    share = (largest["mm"] / told["combined_mm"]) ** 2
+    assert told["dominant"] == {"name": largest["name"], "share": pytest.approx(share)}
     assert told["unknown"] == []
     assert told["stated_length"] is None
     stated = with_covariance(scene.calibration, scale={"reference_mm": 240.0, "sigma_mm": 0.05})
@@ -141,8 +145,8 @@ def test_what_cannot_be_told_is_in_no_sum(scene):
     gray = PatternSequence(ProjectorSize(400, 300), GrayPattern(("y",), 9, 9))
     composite = PatternSequence(SEQUENCE.projector, CompositePattern("y", (20.0, 40.0, 60.0, 80.0)))
     stripes = PatternSequence(SEQUENCE.projector, McpPattern(bits=2, carriers=(20.0, 34.0), codes=(0, 1, 2, 3)))
-    for sequence in (composite, stripes):
-        assert "method" in budget_of(scan_of(scene), scene.calibration, sequence, 0.0).unknown
+    for sequence, name in ((composite, "method"), (stripes, "print")):
+        assert name in budget_of(scan_of(scene), scene.calibration, sequence, 0.0).unknown
     found = budget_of(scan_of(scene), scene.calibration, gray, 0.2)
     assert found is not None
     assert [c.name for c in found.contributions] == ["quantisation", "calibration", "sync"]
