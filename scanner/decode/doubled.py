@@ -196,7 +196,9 @@ def _means_differ(k: int, seen: _Seen) -> bool:
         return False
     own, light = seen.samples[k].mean(axis=0), np.median(others, axis=0)
     own = own - float(own @ light) / max(float(light @ light), 1e-9) * light
-    noise = min(float(np.mean((a - b) ** 2)) for a, b in combinations(seen.samples[k], 2)) / 2
+    # Of frames that show the same the difference is noise; higher noise than would let them be seen is not looked for.
+    alike = min(float(np.mean((a - b) ** 2)) for a, b in combinations(seen.samples[k], 2))
+    noise = min(alike, ALIKE * seen.heights2[k]) / 2
     return bool(np.mean(own**2) > MEANS_APART * seen.heights2[k] + noise)
 
 

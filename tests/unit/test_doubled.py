@@ -114,6 +114,15 @@ def test_of_four_shifts_no_value_is_left_and_the_frames_are_named(k, faults, tol
     assert sum(found.details["counts"].values()) == found.reason.size
 
 
+def test_a_set_of_three_that_begins_with_the_last_frame_of_the_one_before_is_named():
+    sequence, frames, _ = captured(3)
+    frames[3] = frames[2]
+    found = decoded(sequence, frames)
+    told = "frame 3 shows what frame 2 shows: the set is out of step; capture again"
+    assert found.warnings == (f"frequency 4 along y: {told}",)
+    assert not np.isfinite(found.rows).any()
+
+
 @pytest.mark.parametrize("shifts", [5, 8])
 def test_a_set_that_begins_with_the_last_frame_of_the_one_before_is_decoded_without_it(shifts):
     sequence, frames, rows = captured(shifts)
