@@ -194,6 +194,15 @@ def _see_anew(upright: Image, model: PatternModel, camera: CameraFormat, crossin
     again = decide(found, model, clock, over) if found.fault is None else decided
     if again.agreement.holds:
         return _Seen(reversed_image, found, again, model, True, clock)
+    if first.search is not None and first.search.aspect != 1:
+        # Harmonics of print may outshine the carriers, and pass for those of pixels of another shape.
+        for image, over_turned in ((upright, False), (reversed_image, True)):
+            found = locate(image, model, camera, clock, aspects=())
+            if found.fault is not None:
+                continue
+            square = decide(found, model, clock, over if over_turned else crossings)
+            if square.agreement.holds:
+                return _Seen(image, found, square, model, over_turned, clock)
     _refuse_turned(upright, model, camera)
     a = max(decided.agreement, again.agreement, key=lambda agreement: (agreement.tells, agreement.agree))
     said, figures, hint = _of_codes(a, first, model, camera)

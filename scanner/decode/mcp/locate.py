@@ -142,7 +142,14 @@ class Known:
         return near and now.hits >= 0.9 * self.hits and now.decided >= 0.7 * self.decided
 
 
-def locate(image: Image, model: PatternModel, camera: CameraFormat, clock: Stages, known: Known | None = None) -> Found:
+def locate(
+    image: Image,
+    model: PatternModel,
+    camera: CameraFormat,
+    clock: Stages,
+    known: Known | None = None,
+    aspects: tuple[float, ...] = ASPECTS,
+) -> Found:
     """Find stripes and carriers.
 
     Args:
@@ -151,6 +158,7 @@ def locate(image: Image, model: PatternModel, camera: CameraFormat, clock: Stage
         camera: the frame's format.
         clock: takes the stages' times.
         known: of a frame before: no pitch and no carriers are searched then.
+        aspects: shapes of the projector's pixels that are tried besides square ones.
 
     Returns:
         what was found; its `fault` says why there is no pattern, if there is none.
@@ -176,7 +184,7 @@ def locate(image: Image, model: PatternModel, camera: CameraFormat, clock: Stage
         if trial.plain:
             return trial
         best = trial if best is None or trial.rank > best.rank else best
-    for aspect in ASPECTS:
+    for aspect in aspects:
         pitch, match = candidates[0]
         trial = _search(replace(found, pitch=pitch, match=match), image, model, camera, clock, aspect)
         if trial.plain:
