@@ -299,8 +299,7 @@ all_of: Callable[[Lanes], bool] = _intrinsic(_all_of)
 
 def _lowest(context: Any, values: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        kind = ir.FunctionType(ir.FloatType(), [_FLOATS.vector])
-        name = f"llvm.vector.reduce.fmin.v{LANES}f32"
+        kind, name = ir.FunctionType(ir.FloatType(), [_FLOATS.vector]), f"llvm.vector.reduce.fmin.v{LANES}f32"
         return builder.call(_compiler.get_or_insert_function(builder.module, kind, name), arguments)
 
     return (types.float32(values), generate) if values is _FLOATS else None

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from scanner.decode import Map
 from scanner.decode.addresses import pixels_at
-from scanner.decode.near_ends import boxes_near_ends
 from scanner.kernel import kernel
 from scanner.sample_lanes import LINE
 
@@ -55,48 +54,35 @@ def beyond_ends(
     """
     if not least_share or not marked.any():
         return np.empty(0, np.intp)
-    found = [
-        _beyond(position, width, box, along, end == 1, cell_px + ALSO_NEAR_PX, least_share, pairs, like, marked)
-        for end, box in boxes_near_ends(position, width, along).items()
-    ]
-    return np.unique(np.concatenate(found)) if found else np.empty(0, np.intp)
+    return _beyond(position, width, along, cell_px + ALSO_NEAR_PX, least_share, pairs, like, marked)
 
 
 @kernel
 def _beyond(
     position: Map,
     width: int,
-    box: tuple[int, int, int, int],
     along: int,
-    last: bool,
     near: float,
     least_share: float,
     pairs: NDArray[np.intp],
     like: NDArray[Any],
     marked: NDArray[np.uint8],
 ) -> NDArray[np.intp]:
-    """One end's, within its box: top, bottom, left, right."""
-    top, bottom, left, right = box
+    """See `beyond_ends`. near: projector px from an end, within which a pixel is held against others."""
     height, found = position.size // width, 0
     out = np.empty(LINE * np.count_nonzero(marked), np.intp)
-    for y in range(top, bottom):
-        x = left
-        while x < right:
-            line = (y * width + x) // LINE
-            if marked[line] == 0:
-                x = (line + 1) * LINE - y * width
-                continue
-            inside = position[y * width + x] + np.float32(0.5)
-            if (along - inside if last else inside) < near:
-                best = np.float32(0)
+    for begin in np.flatnonzero(marked) * LINE:
+        for i in range(int(begin), min(int(begin) + LINE, position.size)):
+            inside = position[i] + np.float32(0.5)
+            if min(inside, along - inside) < near:
+                y, x, best = i // width, i % width, np.float32(0)
                 for far in AROUND:
                     for down, across in ((far, 0), (-far, 0), (0, far), (0, -far)):
                         row, column = min(max(y + down, 0), height - 1), min(max(x + across, 0), width - 1)
                         best = max(best, _contrast(row * width + column, pairs, like))
-                if _contrast(y * width + x, pairs, like) < np.float32(least_share) * best:
-                    out[found] = y * width + x
+                if _contrast(i, pairs, like) < np.float32(least_share) * best:
+                    out[found] = i
                     found += 1
-            x += 1
     return out[:found]
 
 
