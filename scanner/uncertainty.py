@@ -34,8 +34,12 @@ from scanner.patterns.sequence import Precorrection
 from scanner.scan import Scan
 from scanner.stated_length import StatedLength, stated_length_of
 
-COVERAGE_FACTOR = 2.0
-"""Of the expanded uncertainty: 95 % of a normal error."""
+COVERAGE_FACTOR, OF_CELLS = 2.0, 0.95 * math.sqrt(3)
+"""Of the expanded uncertainty: 95 % of a normal error, and of one that is anything within a cell alike (JCGM 100:2008,
+G.1.3 and 4.3.7)"""
+
+NEARLY_ALL = 0.9
+"""Of the variance, from where on the sum of all causes is distributed as the one is"""
 
 MEDIAN_OF = 20_000
 """Points of a scan that are asked"""
@@ -100,6 +104,12 @@ class Budget:
         return math.hypot(self.of("random"), self.of("systematic"))
 
     @property
+    def coverage_factor(self) -> float:
+        """That of 95 % for the median point."""
+        name, share = self.dominant or ("", 0.0)
+        return OF_CELLS if name == QUANTISATION and share > NEARLY_ALL else COVERAGE_FACTOR
+
+    @property
     def dominant(self) -> tuple[str, float] | None:
         """The largest known one of the median point, and its share of the variance; None where none is known."""
         largest = max(self.contributions, key=lambda c: c.mm or 0.0, default=None)
@@ -116,8 +126,8 @@ class Budget:
             "random_mm": self.of("random"),
             "systematic_mm": self.of("systematic"),
             "combined_mm": self.combined_mm,
-            "expanded_mm": COVERAGE_FACTOR * self.combined_mm,
-            "coverage_factor": COVERAGE_FACTOR,
+            "expanded_mm": self.coverage_factor * self.combined_mm,
+            "coverage_factor": self.coverage_factor,
             "within_mm": self.within_mm,
             "dominant": None if dominant is None else {"name": dominant[0], "share": dominant[1]},
             "unknown": list(self.unknown),

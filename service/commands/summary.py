@@ -153,11 +153,12 @@ def _uncertainty(budget: Mapping[str, Any]) -> tuple[str, str] | None:
 
 
 def _of_median(budget: Mapping[str, Any]) -> str:
-    """The median point's figure and its parts, whose squares add up to its square: k = 2 all of them.
+    """The median point's figure and its parts, whose squares add up to its square, all with the same k.
 
     A kind of which nothing is known has no part, not one of 0.
     """
-    parts = {kind: 2 * budget[f"{kind}_mm"] for kind in ("random", "systematic") if budget[f"{kind}_mm"]}
+    k = budget["coverage_factor"]
+    parts = {kind: k * budget[f"{kind}_mm"] for kind in ("random", "systematic") if budget[f"{kind}_mm"]}
     words = [f"+-{alone(part)} mm {kind}" for kind, part in parts.items()]
     words += [f"mostly {dominant['name']}"] if (dominant := budget.get("dominant")) else []
-    return f"the median one +-{alone(math.hypot(*parts.values()))} mm: {', '.join(words)} (k = 2)"
+    return f"the median one +-{alone(math.hypot(*parts.values()))} mm: {', '.join(words)} (k = {k:.3g})"

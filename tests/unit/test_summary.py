@@ -37,6 +37,7 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
             "expanded_mm": 0.144,
             "within_mm": 0.163,
             "depth_mm": 700.2,
+            "coverage_factor": 2.0,
             "random_mm": 0.07,
             "systematic_mm": 0.0169,
             "dominant": {"name": "noise", "share": 0.95},
@@ -81,6 +82,7 @@ def test_what_a_method_adds_unknown_gets_no_figure_of_the_whole(
     budget = {
         "within_mm": 0.2,
         "depth_mm": 700.0,
+        "coverage_factor": 2.0,
         "random_mm": 0.07,
         "systematic_mm": 0.0,
         "unknown": ["calibration", "method"],

@@ -102,6 +102,10 @@ def test_cells_of_a_code_are_rectangular():
     budget = Budget(700.0, (Contribution("quantisation", "systematic", 0.5, 0.5, ""),), sigmas)
     assert budget.within_mm == pytest.approx(0.95 * np.sqrt(3) * 0.5, rel=1e-3)
     assert budget.within_mm == pytest.approx(drawn(sigmas, lambda rng, n: rng.uniform(-1, 1, n) * np.sqrt(3)), rel=0.02)
+    # 95 of 100 of a rectangular error: less than twice its sigma.
+    assert budget.as_dict()["expanded_mm"] == pytest.approx(0.5 * 0.95 * 3**0.5)
+    noisy = Budget(700.0, (*budget.contributions, Contribution("calibration", "systematic", 0.5, 0.5, "")), sigmas)
+    assert noisy.coverage_factor == 2
 
 
 def test_sums_are_those_of_what_is_known(scene):
