@@ -9,8 +9,8 @@ rotated as a whole leaves nothing at any number (`rotated`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import Any
 
@@ -148,7 +148,15 @@ def misplaced_frames(frames: AxisFrames, sample: Sample) -> list[Misplaced]:
             found += _of_three(k, seen)
         elif k in verdicts:
             found += verdicts[k].found(min((v.noise for j, v in verdicts.items() if j != k), default=None))
-    return found
+    return [replace(one, mended=False) for one in found] if _all_may_be_late(found, verdicts, frames.shifts) else found
+
+
+def _all_may_be_late(found: list[Misplaced], sets: Iterable[int], shifts: tuple[int, ...]) -> bool:
+    """Whether the first frame of every set is false, or the last one, as where each frame of a scan shows the one
+    before it, or behind it. The others of a set are a fringe one shift off then, which no residual tells from a true
+    one, and steps do not always."""
+    false = {one.of_set: one.orders[0].false for one in found if len(one.orders) == 1}
+    return all(false.get(k) == (0,) for k in sets) or all(false.get(k) == (shifts[k] - 1,) for k in sets)
 
 
 def _lit_pixels(sample: Sample, frames: AxisFrames) -> NDArray[np.intp]:

@@ -12,9 +12,9 @@ SIZE = ProjectorSize(128, 400)
 CAMERA = CameraFormat(160, 120, 8)
 
 
-def captured(shifts, seed=0, noise=1.0, lit=1.0, gain=200.0):
+def captured(shifts, seed=0, noise=1.0, lit=1.0, gain=200.0, frequencies=(1.0, 4.0, 16.0)):
     """A sequence, its frames of a board of which a share is lit, and the rows seen."""
-    sequence = PatternSequence(SIZE, PmpPattern(("y",), (1.0, 4.0, 16.0), (shifts,) * 3))
+    sequence = PatternSequence(SIZE, PmpPattern(("y",), frequencies, (shifts,) * len(frequencies)))
     rows = 20 + 3.0 * np.arange(CAMERA.height)[:, None] + 0.05 * np.arange(CAMERA.width)
     albedo = np.where(np.arange(CAMERA.width) < lit * CAMERA.width, 1.0, 0.02)
     generator = np.random.default_rng(seed)
@@ -60,6 +60,19 @@ def test_coordinates_alone_are_those_of_the_whole_answer(shifts):
     assert brief.warnings[0] == whole.warnings[0]
     np.testing.assert_array_equal(brief.rows, whole.rows)
     np.testing.assert_array_equal(brief.confidence, whole.confidence)
+
+
+@pytest.mark.parametrize("late", [1, -1])
+@pytest.mark.parametrize("shifts", [5, 8])
+def test_a_scan_whose_every_frame_is_late_gives_no_values_where_steps_do_not_tell(shifts, late):
+    # A shift of every set is a whole fringe in the step: (ratio - 1) / shifts = 1.
+    sequence, frames, _ = captured(shifts, frequencies=(1.0, shifts + 1.0))
+    found = decoded(sequence, [frames[(n - late) % len(frames)] for n in range(len(frames))])
+    assert not np.isfinite(found.rows).any()
+    ends = [k * shifts + (0 if late == 1 else shifts - 1) for k in range(2)]
+    for end, told in zip(ends, found.warnings, strict=False):
+        assert f"frame {end} shows" in told
+        assert ": the set is out of step; capture again" in told
 
 
 def shown(frames, first, faults):
