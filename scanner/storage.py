@@ -242,7 +242,7 @@ def storage_errors(path: Path) -> Iterator[None]:
         errno.EACCES: "this user may not write there",
         errno.EPERM: "this user may not write there",
         errno.EROFS: "the file system is read-only",
-        errno.ENOENT: "nothing can be made there: give a place on a disk",
+        errno.ENOENT: "nothing can be made there: make its folder (mkdir -p), or give another place",
         errno.ENOTDIR: "a part of this path is a file: give another",
         errno.EMFILE: "too many open files: raise the limit (ulimit -n)",
     }

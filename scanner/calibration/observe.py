@@ -30,7 +30,7 @@ HEADER_FILE = "capture.json"
 DEEPEST = 3
 """Folders below one that is named in which captures are looked for."""
 MOST_NAMED = 4
-"""Captures or frames with one fault that are named; the others are counted."""
+"""Captures with one fault that are named; the others are counted."""
 FLATTEST = 0.02
 """Width over length of a view's points on the target, below which they lie on a line."""
 
@@ -152,7 +152,7 @@ def observe_capture(path: Path, name: str, target: Target) -> Observation | Left
         capture.header.created,
         capture.header.extra.get("warm_up") or {},
         key,
-        (*_lost(capture), *decoded.warnings),
+        (*filter(None, [capture.lost]), *decoded.warnings),
     )
 
 
@@ -168,15 +168,6 @@ def warnings_of(observations: Sequence[Observation]) -> list[str]:
 def _and_more(what: str, names: Sequence[str]) -> str:
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     return f"{what}{'s' if len(names) > 1 else ''} {', '.join(names[:MOST_NAMED])}{more}"
-
-
-def _lost(capture: Capture) -> list[str]:
-    """Words for the frames of a capture that are not here."""
-    lost = capture.missing
-    if not lost:
-        return []
-    named = _and_more("frame", [str(k) for k in lost])
-    return [f"{named} of {capture.header.frame_count} lost: {capture.fault(lost[0])}"]
 
 
 def observe_decoded(

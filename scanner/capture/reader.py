@@ -26,6 +26,8 @@ from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat
 
 _WHAT_TO_GIVE = "give a capture folder, its capture.json, or the folder of a scan"
+MOST_NAMED = 4
+"""Frames of one fault that are named; the others are counted."""
 SCAN_FOLDER = "capture"
 """Where a scan's folder has its capture"""
 
@@ -112,6 +114,15 @@ class Capture:
         return tuple(index for index in range(self.header.frame_count) if index not in self._records)
 
     @property
+    def lost(self) -> str | None:
+        """Which frames of a whole capture are not here, in words, and what is to blame for the first; None: all are."""
+        if not self.missing:
+            return None
+        named, more = ", ".join(map(str, self.missing[:MOST_NAMED])), len(self.missing) - MOST_NAMED
+        frames = f"frame{'s' if len(self.missing) > 1 else ''} {named}{f' and {more} more' if more > 0 else ''}"
+        return f"{frames} of {self.header.frame_count} lost: {self.fault(self.missing[0])}"
+
+    @property
     def calibration_path(self) -> Path | None:
         """The calibration file the capture names, if it names a file.
 
@@ -126,9 +137,10 @@ class Capture:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the frames that were read are not, and need not be, but had better be."""
+        said = () if self.lost is None or self.header.frames is not None else (self.lost,)
         if True not in self._colours:
-            return ()
-        return (f"the frames are colour images ({self._colours[True]}): read as luma, grey ones measure better",)
+            return said
+        return (f"the frames are colour images ({self._colours[True]}): read as luma, grey ones measure better", *said)
 
     def frame(self, pattern: int) -> Pixels:
         """The frame of a pattern index: (height, width) uint8 or uint16, a read-only view where possible.

@@ -53,10 +53,12 @@ def target(
         raise typer.BadParameter(f"-o: {output} exists; --force replaces it")
     from scanner.calibration.target_svg import target_svg  # noqa: PLC0415
     from scanner.calibration.targets import parse_target  # noqa: PLC0415
-    from scanner.storage import replace_file  # noqa: PLC0415
+    from scanner.storage import replace_file, storage_errors  # noqa: PLC0415
 
     chosen = parse_target(spec)
     drawing = target_svg(chosen, grey)
+    with storage_errors(output):
+        output.parent.mkdir(parents=True, exist_ok=True)
     replace_file(output, drawing.text.encode())
     first, last = chosen.longest
     contrast = 1 - grey
