@@ -9,7 +9,7 @@ rotated as a whole leaves nothing at any number (`rotated`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import Any
@@ -84,6 +84,15 @@ class Misplaced:
     orders: tuple[Order, ...]
     source: tuple[int, int] | None = None
 
+    @property
+    def late(self) -> int:
+        """1 where a set's first frame shows nothing of it, -1 where its last one does: all of its others may be late by
+        a shift then, or early, which no residual tells; else 0."""
+        if len(self.orders) != 1 or len(self.orders[0].false) != 1:
+            return 0
+        shows, (false,) = self.orders[0].shows, self.orders[0].false
+        return {0: 1, len(shows) - 1: -1}.get(false, 0) if shows[false] == NONE else 0
+
     def says(self, position: Callable[[int, int], int]) -> str:
         """In words. position: of (set, frame) in the sequence."""
         if not self.orders:
@@ -148,15 +157,10 @@ def misplaced_frames(frames: AxisFrames, sample: Sample) -> list[Misplaced]:
             found += _of_three(k, seen)
         elif k in verdicts:
             found += verdicts[k].found(min((v.noise for j, v in verdicts.items() if j != k), default=None))
-    return [replace(one, mended=False) for one in found] if _all_may_be_late(found, verdicts, frames.shifts) else found
-
-
-def _all_may_be_late(found: list[Misplaced], sets: Iterable[int], shifts: tuple[int, ...]) -> bool:
-    """Whether the first frame of every set is false, or the last one, as where each frame of a scan shows the one
-    before it, or behind it. The others of a set are a fringe one shift off then, which no residual tells from a true
-    one, and steps do not always."""
-    false = {one.of_set: one.orders[0].false for one in found if len(one.orders) == 1}
-    return all(false.get(k) == (0,) for k in sets) or all(false.get(k) == (shifts[k] - 1,) for k in sets)
+    late = {one.of_set: one.late for one in found}
+    # Of all sets the steps between them do not always tell.
+    all_late = any(all(late.get(k) == by for k in verdicts) for by in (1, -1))
+    return [replace(one, mended=False) for one in found] if all_late else found
 
 
 def _lit_pixels(sample: Sample, frames: AxisFrames) -> NDArray[np.intp]:

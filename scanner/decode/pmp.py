@@ -12,6 +12,7 @@ that shows what another one of its set shows is left out, and named (`doubled`).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ from scanner.decode.lone_set import require_fringes
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps, undecided
 from scanner.decode.pmp_frames import axis_frames
 from scanner.decode.pmp_plan import plan_axis, whole_sets
-from scanner.decode.rotated import cannot_reveal, out_of_step, rotated_sets
+from scanner.decode.rotated import cannot_reveal, hides_late_set, out_of_step, rotated_sets
 from scanner.decode.strips import threads_to_use
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
@@ -205,6 +206,11 @@ class PmpDecoder:
             return []
         sets = [s for s in self._pattern.sets() if s.axis == axis]
         faults = misplaced_frames(axis_frames(self._pattern, axis, self._frames), found.sample)
+        shifts, ladder = self._pattern.shifts, found.ladder
+        faults = [
+            replace(one, mended=False) if one.late and hides_late_set(ladder, one.of_set, one.late, shifts) else one
+            for one in faults
+        ]
         for fault in faults:
             told = fault.says(lambda k, n: self._sequence.fringes[sets[k].first + n])
             self._doubled.append(f"frequency {sets[fault.of_set].frequency:g} along {axis}: {told}; capture again")

@@ -91,6 +91,11 @@ def cannot_reveal(frequencies: tuple[float, ...], shifts: tuple[int, ...]) -> tu
     return tuple(found)
 
 
+def hides_late_set(ladder: Ladder, of_set: int, by: int, shifts: Sequence[int]) -> bool:
+    """Whether no step would tell that a set shows each shift `by` too late, 1, or too early, -1."""
+    return _is_hidden(ladder, Rotated(of_set, by), shifts)
+
+
 def _is_hidden(ladder: Ladder, rotated: Rotated, shifts: Sequence[int]) -> bool:
     return bool(np.abs(_left(ladder, _turns(rotated, shifts))).max(initial=0.0) < LEAST_OFFSET)
 

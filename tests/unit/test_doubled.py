@@ -75,6 +75,14 @@ def test_a_scan_whose_every_frame_is_late_gives_no_values_where_steps_do_not_tel
         assert ": the set is out of step; capture again" in told
 
 
+def test_a_set_that_may_be_early_as_a_whole_gives_no_values_where_steps_do_not_tell():
+    # A shift of the coarse set is a whole fringe of the finer one: 8 / 8.
+    sequence, frames, _ = captured(8, frequencies=(1.0, 8.0))
+    found = decoded(sequence, frames[1:9] + frames[8:])
+    assert not np.isfinite(found.rows).any()
+    assert "frequency 1 along y: frame 7 shows what frame 8 shows: the set is out of step" in found.warnings[0]
+
+
 def shown(frames, first, faults):
     """The same with frames of a set in place of others of it."""
     taken = list(frames)
