@@ -39,6 +39,8 @@ OTHER_SIZES = 1.2 ** np.arange(-5.0, 6.0)
 taken for a diameter, and scales that are wrong by as much"""
 OTHER_SAMPLE = 4000
 """Points of a scan that are asked for it"""
+OUTLINE = 0.9
+"""Of a ball's radius: rays that pass it nearer than that see nothing else, however blurred its edge is."""
 ROUND_SHARE = 0.02
 """Of its diameter, rms: what fits a sphere worse is something else that is round, as a head (4 to 7 %)"""
 
@@ -62,7 +64,8 @@ class Flatness:
 class Probing:
     """A sphere. form_mm: spread of the radial distances, 99.7 % of the points (PF); shell_mm: the same of 95 % (the
     dispersion of ISO 10360-8 and -13); size_mm: diameter less the stated one (PS), None where none was stated;
-    rms_mm: of the radial distances."""
+    rms_mm: of the radial distances; left_out: share of the points seen within the ball's outline that no figure
+    contains, since they lie too far off it."""
 
     form_mm: float
     shell_mm: float
@@ -72,6 +75,7 @@ class Probing:
     centre_mm: tuple[float, float, float]
     points: int
     used: float
+    left_out: float
 
 
 @dataclass(frozen=True)
@@ -98,11 +102,12 @@ class Repeatability:
 @dataclass(frozen=True, eq=False)
 class FeaturePoints:
     """Of a scan, those that belong to one feature. points: (n, 3) mm; at: (n,) their places in the scan, flat; used:
-    share of the scan's points."""
+    share of the scan's points; left_out: see `Probing`."""
 
     points: Array
     at: NDArray[np.intp]
     used: float
+    left_out: float = 0.0
 
 
 def flat_board(xyz: NDArray[Any]) -> Flatness:
@@ -181,7 +186,15 @@ def sphere_points(xyz: NDArray[Any], diameter_mm: float | None = None) -> Featur
     figures = sphere_figures(points[used])
     if figures["rms_mm"] > ROUND_SHARE * figures["diameter_mm"]:
         raise _no_sphere(points, 0, diameter_mm)
-    return FeaturePoints(points[used], at[used], float(used.mean()))
+    seen = _within_outline(points, *sphere_through(points[used]))
+    return FeaturePoints(points[used], at[used], float(used.mean()), float((seen & ~used).sum() / max(seen.sum(), 1)))
+
+
+def _within_outline(points: Array, centre: Array, radius: float) -> NDArray[np.bool_]:
+    """Points on rays from the camera, which is at 0, that pass well within a ball."""
+    rays = points / np.linalg.norm(points, axis=1)[:, None]
+    beside = np.linalg.norm(centre - (rays @ centre)[:, None] * rays, axis=1)
+    return np.asarray(beside < OUTLINE * radius)
 
 
 def measured_sphere(on: FeaturePoints, diameter_mm: float | None = None) -> Probing:
@@ -194,6 +207,7 @@ def measured_sphere(on: FeaturePoints, diameter_mm: float | None = None) -> Prob
         centre_mm=(x, y, z),
         points=len(on.points),
         used=on.used,
+        left_out=on.left_out,
     )
 
 

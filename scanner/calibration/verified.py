@@ -26,6 +26,7 @@ from scanner.calibration.figure_spread import (
 from scanner.calibration.marks import Marks, measured_marks
 from scanner.calibration.targets import Target
 from scanner.calibration.verification import (
+    LEFT_OUT,
     FeaturePoints,
     board_points,
     length_between,
@@ -108,14 +109,21 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
 
 def _warnings(found: dict[str, Any]) -> list[str]:
     """What the figures do not say of themselves."""
+    warnings = []
     used = sum(found[kind]["used"] for kind in ("flat", "sphere") if kind in found)
-    if "flat" not in found or used >= FEW_USED:
-        return []
-    return [
-        f"the board's figures are of {found['flat']['used']:.0%} of the scan's points: the others lie off its plane by "
-        "more than eight times the usual. Is all of it one board? Keep what is not out of the scan (fringed decode "
-        "--box or --depth), or it is bent or broken by more than these figures say"
-    ]
+    if "flat" in found and used < FEW_USED:
+        warnings.append(
+            f"the board's figures are of {found['flat']['used']:.0%} of the scan's points: the others lie off its "
+            "plane by more than eight times the usual. Is all of it one board? Keep what is not out of the scan "
+            "(fringed decode --box or --depth), or it is bent or broken by more than these figures say"
+        )
+    if "sphere" in found and found["sphere"]["left_out"] > LEFT_OUT:
+        warnings.append(
+            f"{found['sphere']['left_out']:.1%} of the points within the ball's outline lie off it by more than eight "
+            "times the usual, and are in none of its figures: form and size are no PF and PS of VDI/VDE 2634-2, which "
+            "leaves three points in a thousand out. Wrong fringes or stripes do this, or something before the ball"
+        )
+    return warnings
 
 
 def rig_of(folder: Path, scan: Scan, given: Path | None = None) -> tuple[Rig | None, str | None]:

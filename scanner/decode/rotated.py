@@ -84,6 +84,8 @@ def cannot_reveal(frequencies: tuple[float, ...], shifts: tuple[int, ...]) -> tu
         if hidden:
             turns = ", ".join(map(str, hidden))
             found.append(f"frequency {frequency:g} shown {turns} of its {count} shifts late or early as a whole")
+    if set(shifts) == {3} and len(shifts) > 1 and _is_hidden(ladder, Rotated(None, 1), shifts):
+        found.append("every frame of the sequence one late or early")
     if {3, 4} & set(shifts):
         found.append(
             "two frames of three shifts exchanged, or of four half a turn apart, where steps do not contradict"

@@ -93,6 +93,19 @@ def test_sphere_form_and_size() -> None:
     assert sphere(ball()[40:80, 60:100]).size_mm is None
 
 
+def test_points_off_a_ball_that_no_figure_contains_are_warned_of(tmp_path: Path) -> None:
+    spoilt = ball(noise_mm=0.03)
+    seen = np.linalg.norm(spoilt[..., :2], axis=2) < 20
+    spoilt[:60][seen[:60], 2] -= np.where(np.arange(seen[:60].sum()) % 10, 0, 15)
+    folders = [save(tmp_path / name, xyz) for name, xyz in (("whole", ball(noise_mm=0.03)), ("spoilt", spoilt))]
+    found = [verified(folder, load_scan(folder), Wanted(sphere_mm=50.0)) for folder in folders]
+    assert found[0]["warnings"] == []
+    (said,) = found[1]["warnings"]
+    assert found[1]["sphere"]["left_out"] == pytest.approx(0.05, abs=0.02)
+    assert "of the points within the ball's outline lie off it" in said
+    assert "no PF and PS of VDI/VDE 2634-2" in said
+
+
 def test_small_sphere_before_a_wide_wall() -> None:
     found = sphere(ball(radius=12.0, noise_mm=0.01), 24.0)
     assert found.used < 0.1
