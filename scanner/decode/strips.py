@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, lru_cache
-from typing import TypeVar
+from queue import SimpleQueue
+from threading import Thread
+from time import sleep
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
@@ -22,6 +24,9 @@ MAX_THREADS = 4
 
 MIN_STRIP = 2048
 """Pixels: strips begin at multiples of it, so that their tiles begin with whole cache lines."""
+
+_PATIENCE = 2e-5
+"""Seconds between two looks at whether another thread is ready, where one has to wait for it"""
 
 _T = TypeVar("_T")
 
@@ -72,7 +77,7 @@ class Shared:
         (see `pmp_strips.decode_strips`). counts: how many numbers it adds to."""
         self._work, self._gate, self._opened, self._finished = work, new_gate(), False, False
         self._counts = np.zeros((threads, counts), np.int64)
-        self._others: dict[int, Future[bool]] = {}
+        self._others: dict[int, _Call] = {}
         self._call(range(1, threads))
 
     def _call(self, numbers: Iterable[int]) -> None:
@@ -116,10 +121,82 @@ class Shared:
             self._join()
 
 
+class _Call:
+    """Work for another thread, and what became of it.
+
+    Without a lock, which an interrupt may leave taken for ever if it comes just then (`concurrent.futures` has one
+    in every future): each word is written by one side only, and the interpreter keeps their order.
+    """
+
+    def __init__(self, call: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+        self._call, self._arguments = call, arguments
+        self._begun = self._cancelled = self._over = False
+        self._value: Any = None
+        self._error: BaseException | None = None
+
+    def run(self) -> None:
+        """By the other thread."""
+        self._begun = True
+        try:
+            if not self._cancelled:
+                self._value = self._call(*self._arguments)
+        except BaseException as error:  # noqa: BLE001  (it is raised by who asks for the result)
+            self._error = error
+        self._arguments = ()
+        self._over = True
+
+    def cancel(self) -> bool:
+        """Whether it has not begun, and will not."""
+        self._cancelled = True
+        return not self._begun
+
+    def done(self) -> bool:
+        """Whether it is over."""
+        return self._over
+
+    def result(self) -> Any:
+        """What it returned or raised, when it is over."""
+        while not self._over:
+            sleep(_PATIENCE)
+        if self._error is not None:
+            raise self._error
+        return self._value
+
+
+class _Crew:
+    """Threads that stay: to start and to end one takes as long as a twentieth of an image. They end with the process,
+    whatever they are at."""
+
+    def __init__(self) -> None:
+        self._calls: SimpleQueue[_Call] = SimpleQueue()
+        self._threads: list[Thread] = []
+
+    def submit(self, call: Callable[..., Any], *arguments: Any) -> _Call:
+        """Have it called by a thread.
+
+        Raises:
+            RuntimeError: there is none, and none can be had.
+        """
+        if len(self._threads) < MAX_THREADS - 1:
+            try:
+                thread = Thread(target=self._serve, name=f"strips_{len(self._threads)}", daemon=True)
+                thread.start()
+                self._threads.append(thread)
+            except RuntimeError:
+                if not self._threads:
+                    raise
+        handed = _Call(call, arguments)
+        self._calls.put(handed)
+        return handed
+
+    def _serve(self) -> None:
+        while True:
+            self._calls.get().run()
+
+
 @cache
-def _crew() -> ThreadPoolExecutor:
-    """Threads that stay: to start and to end one takes as long as a twentieth of an image."""
-    return ThreadPoolExecutor(MAX_THREADS - 1, thread_name_prefix="strips")
+def _crew() -> _Crew:
+    return _Crew()
 
 
 os.register_at_fork(after_in_child=_crew.cache_clear)

@@ -106,7 +106,7 @@ def test_what_fails_is_told_when_the_others_are_done_or_sent_away(opened):
 
 def test_an_interrupt_before_the_context_leaves_no_thread_waiting():
     Shared(work_of(40, []), 4, 2)  # as if a signal came between the call and the `with`
-    assert [future.result(timeout=30) for future in (strips._crew().submit(int) for _ in range(3))] == [0, 0, 0]
+    assert [future.result() for future in (strips._crew().submit(int) for _ in range(3))] == [0, 0, 0]
 
 
 @pytest.mark.parametrize("refused", [0, 1])
@@ -127,4 +127,4 @@ def test_without_more_threads_one_does_it_all(refused, monkeypatch):
         counts = shared.finish()
     assert taken == list(range(40))
     assert counts.tolist() == [40, sum(range(40))]
-    assert all(future.result(timeout=30) for future in submitted)
+    assert all(future.result() for future in submitted)
