@@ -125,7 +125,7 @@ class PmpDecoder:
                 self._decode(axis)
         for axis, found in self._found.items():
             self._require_fringes(axis, found)
-            warnings += doubtful_counts(axis, found.remainders)
+            warnings += disagreements(axis, found.remainders) + doubtful_counts(axis, found.remainders)
             if (changes := found.light.flicker) is not None:
                 warnings += tuple(filter(None, [changes.warning(axis, found.random_px)]))
             if found.ripple is not None and (ripple := found.ripple.warning(axis, found.light)) is not None:
@@ -153,7 +153,8 @@ class PmpDecoder:
         shape = self._camera.shape
         position, confidence = found.maps.position.reshape(shape), found.maps.confidence.reshape(shape)
         rows, columns = (position, None) if axis == "y" else (None, position)
-        return Coordinates(rows, columns, confidence, (*self._doubled, *warnings))
+        warnings = (*self._doubled, *warnings, *disagreements(axis, found.remainders))
+        return Coordinates(rows, columns, confidence, warnings)
 
     def _took(self, fringe: int, frame: NDArray[Any]) -> None:
         self._frames[fringe] = frame
@@ -192,11 +193,9 @@ class PmpDecoder:
         if all(fault.mended for fault in faults):
             found = self._decoded_axis(axis, brief) if faults else found
             frequencies, shifts = self._pattern.frequencies, self._pattern.shifts
-            rotated = rotated_sets(found.ladder, found.remainders, shifts)
-            apart = disagreements(axis, found.remainders)
-            if not rotated and not apart:
+            if not (rotated := rotated_sets(found.ladder, found.remainders, shifts)):
                 return found
-            self._doubled += out_of_step(axis, rotated, frequencies, shifts) or apart
+            self._doubled += out_of_step(axis, rotated, frequencies, shifts)
         self._ends[axis] = None
         return undecided(found)
 
