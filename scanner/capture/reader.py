@@ -137,10 +137,9 @@ class Capture:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the frames that were read are not, and need not be, but had better be."""
-        said = () if self.lost is None or self.header.frames is not None else (self.lost,)
         if True not in self._colours:
-            return said
-        return (f"the frames are colour images ({self._colours[True]}): read as luma, grey ones measure better", *said)
+            return ()
+        return (f"the frames are colour images ({self._colours[True]}): read as luma, grey ones measure better",)
 
     def frame(self, pattern: int) -> Pixels:
         """The frame of a pattern index: (height, width) uint8 or uint16, a read-only view where possible.
