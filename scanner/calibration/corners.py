@@ -1,8 +1,9 @@
 """Corners of squares to a few hundredths of a pixel: a blurred saddle fitted to the image around each.
 
-Two straight edges cross in a corner and both are blurred alike by lens and pixel: the model is the product of two
-error functions on a sloping ground, nine quantities to some hundred pixels, by Gauss-Newton. Corners of squares keep
-their place under perspective, so nothing is left to correct. Finding them in the first place is `detection`'s task.
+Two edges cross in a corner and both are blurred alike by lens and pixel: the model is the product of two error
+functions on a sloping ground, eleven quantities to some hundred pixels, by Gauss-Newton. Corners of squares keep their
+place under perspective; a lens that distorts bends the edges, by as much as `bends` tells of the whole view. Finding
+corners in the first place is `detection`'s task.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ class Corners:
     sigma: Array
 
 
-def refine_corners(image: NDArray[Any], points: Array, along: Array, down: Array, radius: Array) -> Corners:
+def refine_corners(
+    image: NDArray[Any], points: Array, along: Array, down: Array, radius: Array, bends: Array | None = None
+) -> Corners:
     """Fit each corner.
 
     Args:
@@ -40,6 +43,7 @@ def refine_corners(image: NDArray[Any], points: Array, along: Array, down: Array
         points: (N, 2) px, where the corners were found.
         along, down: (N, 2) directions of the two edges in the image, any length.
         radius: (N,) px of the round window; must hold nothing but the two edges.
+        bends: (N, 2) 1/px, curvature of the edges along and down (`line_bends`); None: they are straight.
 
     Returns:
         Corners, NaN where the window leaves the image or the fit does not settle within it.
@@ -49,13 +53,16 @@ def refine_corners(image: NDArray[Any], points: Array, along: Array, down: Array
     sigma = np.full(len(points), np.nan)
     for i, point in enumerate(points):
         angles = np.arctan2(along[i, 1], along[i, 0]), np.arctan2(down[i, 1], down[i, 0])
-        fitted = _fit(picture, point, angles, max(float(radius[i]), LEAST_RADIUS_PX))
+        curved = (0.0, 0.0) if bends is None else (float(bends[i, 0]), float(bends[i, 1]))
+        fitted = _fit(picture, point, angles, curved, max(float(radius[i]), LEAST_RADIUS_PX))
         if fitted is not None:
             found[i], sigma[i] = fitted
     return Corners(found, sigma)
 
 
-def _fit(picture: Array, point: Array, angles: tuple[float, float], radius: float) -> tuple[Array, float] | None:
+def _fit(
+    picture: Array, point: Array, angles: tuple[float, float], bends: tuple[float, float], radius: float
+) -> tuple[Array, float] | None:
     height, width = picture.shape
     reach = int(np.ceil(radius))
     column, row = (round(float(v)) for v in point)
@@ -67,17 +74,23 @@ def _fit(picture: Array, point: Array, angles: tuple[float, float], radius: floa
     x, y, values = x[near].astype(np.float64), y[near].astype(np.float64), window[near]
     if not np.isfinite(values).all():
         return None
-    return _gauss_newton(x - point[0], y - point[1], values, angles, radius, point)
+    return _gauss_newton(x - point[0], y - point[1], values, angles, bends, radius, point)
 
 
 def _gauss_newton(
-    x: Array, y: Array, values: Array, angles: tuple[float, float], radius: float, point: Array
+    x: Array,
+    y: Array,
+    values: Array,
+    angles: tuple[float, float],
+    bends: tuple[float, float],
+    radius: float,
+    point: Array,
 ) -> tuple[Array, float] | None:
     """Steps on (x0, y0, angle 1, angle 2, log sigma); the six levels are linear and solved for in each."""
     state: Array = np.array([0.0, 0.0, angles[0], angles[1], 0.0])
     step: NDArray[Any] = np.zeros(5)
     for _ in range(STEPS):
-        product, slopes = _saddle(x, y, state)
+        product, slopes = _saddle(x, y, state, bends)
         ground = np.column_stack((np.ones_like(x), x, y))
         linear = np.column_stack((ground, ground * product[:, None]))
         levels, *_ = np.linalg.lstsq(linear, values, rcond=None)
@@ -103,19 +116,21 @@ def _gauss_newton(
     return point + state[:2], float(np.sqrt(np.trace(covariance) / 2))
 
 
-def _saddle(x: Array, y: Array, state: Array) -> tuple[Array, Array]:
+def _saddle(x: Array, y: Array, state: Array, bends: tuple[float, float]) -> tuple[Array, Array]:
     """The product of both edges, -1 .. 1, (N,), and its slopes by the five quantities, (N, 5)."""
     x0, y0, first, second, log_sigma = state
     sigma = np.exp(log_sigma)
     u, v = x - x0, y - y0
     edges, slopes = [], []
-    for angle in (first, second):
+    for angle, bend in zip((first, second), bends, strict=True):
         c, s = np.cos(angle), np.sin(angle)
-        off = (-s * u + c * v) / sigma
+        on, aside = c * u + s * v, -s * u + c * v
+        tilt = bend * on
+        off = (aside - 0.5 * tilt * on) / sigma
         edges.append(erf(off / np.sqrt(2.0)))
         density = np.sqrt(2.0 / np.pi) * np.exp(-0.5 * off * off)
-        turned = density * (-c * u - s * v) / sigma
-        slopes.append((density * s / sigma, -density * c / sigma, turned, -density * off))
+        steep = density / sigma
+        slopes.append((steep * (s + tilt * c), steep * (tilt * s - c), -steep * (on + tilt * aside), -density * off))
     (a, b), (da, db) = edges, slopes
     return a * b, np.column_stack(
         (da[0] * b + a * db[0], da[1] * b + a * db[1], da[2] * b, a * db[2], da[3] * b + a * db[3])

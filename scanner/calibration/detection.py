@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.calibration.bends import line_bends
 from scanner.calibration.corners import refine_corners
 from scanner.calibration.targets import Target
 
@@ -120,18 +121,23 @@ def _is_mirrored(grey: NDArray[np.uint8], target: Target) -> bool:
 def _measured(
     picture: NDArray[np.float32], target: Target, ids: NDArray[np.int64], grid: Array
 ) -> Detection | NotFound:
-    """The corners of a grid (rows, columns, 2), NaN where not seen, measured again."""
+    """The corners of a grid (rows, columns, 2), NaN where not seen, measured again: twice, since only the corners of
+    the whole view tell how its edges are bent."""
     along, down = (neighbour_steps(grid, axis).reshape(-1, 2)[ids] for axis in (1, 0))
     points = grid.reshape(-1, 2)[ids]
     spacing = np.minimum(np.linalg.norm(along, axis=1), np.linalg.norm(down, axis=1))
     alone = ~np.isfinite(spacing)
     along, down = np.where(alone[:, None], (1.0, 0.0), along), np.where(alone[:, None], (0.0, 1.0), down)
     radius = window_radius(target, np.where(alone, 0.0, spacing))
-    refined = refine_corners(picture, points, along, down, radius)
-    kept = np.isfinite(refined.points).all(axis=1) & ~alone
+    straight = refine_corners(picture, points, along, down, radius).points
+    sharp = np.isfinite(straight).all(axis=1) & ~alone
+    bends = np.zeros((len(ids), 2))
+    bends[sharp] = line_bends(target.points[ids[sharp], :2], straight[sharp], np.stack((along, down), axis=1)[sharp])
+    refined = refine_corners(picture, np.where(sharp[:, None], straight, points), along, down, radius, bends).points
+    kept = np.isfinite(refined).all(axis=1) & sharp
     if kept.sum() < FEWEST_POINTS:
         return NotFound(f"{int(kept.sum())} of {len(target.points)} corners are sharp enough to be measured")
-    return Detection(ids[kept], refined.points[kept], spacing[kept])
+    return Detection(ids[kept], refined[kept], spacing[kept])
 
 
 def window_radius(target: Target, spacing: Array) -> Array:
