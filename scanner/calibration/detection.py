@@ -76,9 +76,12 @@ def detect(image: NDArray[Any], target: Target) -> Detection | NotFound:
 
 def _chessboard(picture: NDArray[np.float32], grey: NDArray[np.uint8], target: Target) -> Detection | NotFound:
     size = (target.columns, target.rows)
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
-    found, corners = cv2.findChessboardCornersSB(grey, size, flags=flags)
-    if not found:
+    # Normalised, or searched exhaustively, a clear board is sometimes found shifted by a row, or not at all.
+    for flags in (0, cv2.CALIB_CB_NORMALIZE_IMAGE, cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE):
+        found, corners = cv2.findChessboardCornersSB(grey, size, flags=flags)
+        if found:
+            break
+    else:
         found, corners = cv2.findChessboardCorners(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
     if not found:
         return NotFound(f"no chessboard of {target.columns} x {target.rows} inner corners in the picture")

@@ -96,3 +96,15 @@ def test_too_few_points_are_on_straight_lines() -> None:
     points = TARGET.points[:19, :2]
     directions = np.broadcast_to(np.eye(2), (19, 2, 2))
     assert not line_bends(points, seen(lens(WIDE), points), directions).any()
+
+
+@pytest.mark.parametrize("seed", [25, 36])
+def test_noise_does_not_shift_a_clear_board(seed: int) -> None:
+    """OpenCV's exhaustive search finds these with a row of the border's corners in place of one of the board's."""
+    through = lens(np.zeros(5))
+    clear = picture(through, TARGET)
+    found = detect(clear + np.random.default_rng(seed).normal(0, 3, clear.shape), TARGET)
+    assert isinstance(found, Detection)
+    true = seen(through, TARGET.points[:, :2])
+    assert len(found.ids) == len(true)
+    assert np.linalg.norm(found.points[:, None] - true, axis=2).min(axis=1).max() < 0.05
