@@ -50,6 +50,7 @@ def sense(
     key: tuple[int, ...],
     out: NDArray[np.uint8] | NDArray[np.uint16],
     max_value: int,
+    gain: Plane | None = None,
 ) -> None:
     """Turn light on the sensor into grey levels.
 
@@ -62,6 +63,7 @@ def sense(
         key: of the frame's noise: seed, number, whatever else tells it from others.
         out: (H, W), filled; saturates at `max_value`.
         max_value: largest grey level.
+        gain: (H, W) float32, multiplies the blurred light (`print_blur`).
     """
     if min(light.shape[0] - out.shape[0], light.shape[1] - out.shape[1]) < 2 * (len(taps) - 1):
         raise ValueError(f"light of {light.shape} px does not reach as far around {out.shape} px as the lens blurs")
@@ -73,6 +75,7 @@ def sense(
     _sense(
         light,
         taps,
+        np.empty((0, 0), dtype=np.float32) if gain is None else gain,
         np.float32(electrons),
         np.float32(dn_per_electron),
         np.float32(variance),
@@ -105,7 +108,7 @@ def _mix(z: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 @kernel
-def _sense(light, taps, electrons, dn, variance, noisy, table, starts, signs, top, rolling, line, out):
+def _sense(light, taps, gain, electrons, dn, variance, noisy, table, starts, signs, top, rolling, line, out):
     height, width = out.shape
     reach = taps.shape[0] - 1
     margin = (light.shape[0] - height) // 2
@@ -124,6 +127,10 @@ def _sense(light, taps, electrons, dn, variance, noisy, table, starts, signs, to
             tap = taps[k]
             for c in range(width):
                 line[c] += tap * (above[c] + below[c])
+        if gain.shape[0]:
+            sharper = gain[r]
+            for c in range(width):
+                line[c] *= sharper[c]
         normal = table[starts[r] : starts[r] + width]
         sign = signs[r] * noisy
         target = out[r]

@@ -1,6 +1,7 @@
 """Albedo over a flat body, as printed pictures: samplers, chequers, discs, targets.
 
-A camera pixel sees the mean over its footprint, by exact areas (`coverage`). The lens blurs afterwards (`sensor`).
+A camera pixel sees the mean over its footprint, by exact areas (`coverage`); what the lens's blur makes of it, see
+`print_blur`.
 """
 
 # Kernels: numba types their arguments.
@@ -68,35 +69,36 @@ def chequer(dark: float, bright: float, side_mm: float = 100.0) -> Picture:
     return Picture(np.array([[dark, bright], [bright, dark]], dtype=np.float32), side_mm, tiled=True)
 
 
-def footprint_albedo(
-    picture: Print,
-    rectangle: Array,
-    body: NDArray[np.int32],
-    index: int,
-    directions: Array,
-    origin: Array,
-    shape: tuple[int, ...],
-    albedo: NDArray[np.float32],
-) -> None:
-    """Set the albedo of every pixel that sees body `index` to the picture's mean over the pixel's footprint.
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """What the camera's pixels cover of a printed body.
 
-    Args:
-        picture: what is printed on it.
-        rectangle: the body, as `cast.rectangle` makes it.
-        body: (N,) which body each pixel sees.
-        index: of the rectangle.
-        directions: (N, 3) of the pixels, row by row.
-        origin: (3,) of the rays.
-        shape: (H, W) of the pixels.
-        albedo: (N,) set in place.
+    picture: what is printed. rectangle: the body, as `cast.rectangle` makes it. directions: (N, 3) of the pixels, row
+    by row. origin: (3,) of the rays. width: pixels in a row.
     """
-    rays = (rectangle, body, index, directions, origin, shape[1], albedo)
-    if isinstance(picture, Discs):
-        centres = np.ascontiguousarray(picture.centres, dtype=np.float64)
-        _footprints_discs(centres, picture.radius_mm, picture.inside, picture.around, *rays)
-    else:
-        around = np.float32(picture.around)
-        _footprints(picture.values, picture.mm_per_px, picture.tiled, around, *rays)
+
+    picture: Print
+    rectangle: Array
+    directions: Array
+    origin: Array
+    width: int
+
+    def means(self, pixels: NDArray[np.int64], parts: int = 1) -> NDArray[np.float32]:
+        """(M, parts, parts) mean albedo over the parts of some pixels' footprints, rows first.
+
+        Args:
+            pixels: (M,) which ones, by number.
+            parts: of a footprint, along each of its sides.
+        """
+        means = np.empty((len(pixels), parts, parts), dtype=np.float32)
+        rays = (self.rectangle, pixels, self.directions, self.origin, self.width, means)
+        picture = self.picture
+        if isinstance(picture, Discs):
+            centres = np.ascontiguousarray(picture.centres, dtype=np.float64)
+            _means_of_discs(centres, picture.radius_mm, picture.inside, picture.around, *rays)
+        else:
+            _means_of_raster(picture.values, picture.mm_per_px, picture.tiled, np.float32(picture.around), *rays)
+        return means
 
 
 def _squares(u: Array, v: Array, side: float) -> NDArray[np.bool_]:
@@ -137,35 +139,42 @@ def _print() -> NDArray[np.float32]:
 
 
 @kernel
-def _footprints(values, mm_per_px, tiled, around, rectangle, body, index, directions, origin, width, albedo):
+def _means_of_raster(values, mm_per_px, tiled, around, rectangle, pixels, directions, origin, width, means):
     height_px, width_px = values.shape
-    for i in range(directions.shape[0]):
-        if body[i] != index:
-            continue
-        u, v, ax, ay, bx, by = _footprint(rectangle, directions, origin, width, i)
-        albedo[i] = raster_mean(
-            values,
-            tiled,
-            around,
-            u / mm_per_px + 0.5 * width_px,
-            v / mm_per_px + 0.5 * height_px,
-            ax / mm_per_px,
-            ay / mm_per_px,
-            bx / mm_per_px,
-            by / mm_per_px,
-        )
+    parts = means.shape[1]
+    for i in range(pixels.shape[0]):
+        u, v, ax, ay, bx, by = _footprint(rectangle, directions, origin, width, pixels[i])
+        for r in range(parts):
+            for c in range(parts):
+                along, down = (c + 0.5) / parts - 0.5, (r + 0.5) / parts - 0.5
+                means[i, r, c] = raster_mean(
+                    values,
+                    tiled,
+                    around,
+                    (u + along * ax + down * bx) / mm_per_px + 0.5 * width_px,
+                    (v + along * ay + down * by) / mm_per_px + 0.5 * height_px,
+                    ax / (parts * mm_per_px),
+                    ay / (parts * mm_per_px),
+                    bx / (parts * mm_per_px),
+                    by / (parts * mm_per_px),
+                )
 
 
 @kernel
-def _footprints_discs(centres, radius, inside, around, rectangle, body, index, directions, origin, width, albedo):
-    for i in range(directions.shape[0]):
-        if body[i] != index:
-            continue
-        u, v, ax, ay, bx, by = _footprint(rectangle, directions, origin, width, i)
-        share = 0.0
-        for n in range(centres.shape[0]):
-            share += disc_share(u - centres[n, 0], v - centres[n, 1], ax, ay, bx, by, radius)
-        albedo[i] = around + (inside - around) * share
+def _means_of_discs(centres, radius, inside, around, rectangle, pixels, directions, origin, width, means):
+    parts = means.shape[1]
+    for i in range(pixels.shape[0]):
+        u, v, ax, ay, bx, by = _footprint(rectangle, directions, origin, width, pixels[i])
+        for r in range(parts):
+            for c in range(parts):
+                along, down = (c + 0.5) / parts - 0.5, (r + 0.5) / parts - 0.5
+                x, y = u + along * ax + down * bx, v + along * ay + down * by
+                share = 0.0
+                for n in range(centres.shape[0]):
+                    share += disc_share(
+                        x - centres[n, 0], y - centres[n, 1], ax / parts, ay / parts, bx / parts, by / parts, radius
+                    )
+                means[i, r, c] = around + (inside - around) * share
 
 
 @kernel
@@ -196,6 +205,5 @@ def warm_up() -> None:
     """Compile the kernel (or load it from its cache)."""
     square = np.array([0.0, 0, 0, 9, 1, 0, 0, 0, 1, 0, 0, 0, 1, 5, 5, 0])
     rays = np.array([[0.0, 0.0, 1.0]] * 4)
-    body, albedo = np.zeros(4, dtype=np.int32), np.zeros(4, dtype=np.float32)
     for picture in (chequer(0.1, 0.9), Discs(np.zeros((1, 2)), 1.0, 0.1, 0.9)):
-        footprint_albedo(picture, square, body, 0, rays, np.zeros(3), (2, 2), albedo)
+        Footprints(picture, square, rays, np.zeros(3), 2).means(np.arange(4))

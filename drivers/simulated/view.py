@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from drivers.simulated.cast import Hits, cast_rays, lit_points
 from drivers.simulated.optics import Optics, Plane
+from drivers.simulated.print_blur import print_gain
 from drivers.simulated.rigs import Rig
 from drivers.simulated.scenes import Scene, SceneOptions, build_scene
-from drivers.simulated.textures import Discs, Picture, footprint_albedo
+from drivers.simulated.textures import Discs, Footprints, Picture
 from scanner.devices import Truth
 from scanner.geometry import Lens
 from scanner.kernel import kernel
@@ -37,13 +38,15 @@ class View:
     row, column: float32 projector coordinates + 0.5 (so the picture begins at 0), 0 where no light comes. shade:
     reflected light for full-on light, in shares of what a white facing plane at the aim point would reflect; 0 where no
     light comes: light comes where the truth is lit, and as far beside the picture's ends as its blur carries (`spill`).
-    floor: reflected ambient light in the same unit.
+    floor: reflected ambient light in the same unit. print_gain: (H, W) float32, see `print_blur`; None of a scene
+    without prints, or a camera without blur.
     """
 
     row: Plane
     column: Plane
     shade: Plane
     floor: Plane
+    print_gain: Plane | None
     truth: Truth
     margin: int
 
@@ -51,7 +54,7 @@ class View:
 def view_scene(rig: Rig, scene: Scene, optics: Optics, stride: int = 1, margin: int = 0, spill: int = 0) -> View:
     """Cast and shade a scene; stride > 1 looks at every stride-th pixel only.
 
-    margin, spill: camera px and projector px beyond the two pictures; see `View`.
+    margin, spill: camera px and projector px beyond the two pictures; see `View`. Without margin, no lens blurs prints.
     """
     grid = _pixels(rig.calibration.camera, stride, margin)
     shape = grid.shape[:2]
@@ -60,8 +63,14 @@ def view_scene(rig: Rig, scene: Scene, optics: Optics, stride: int = 1, margin: 
     hits = cast_rays(origin, directions, scene.bodies, scene.field)
     light = rig.to_scene(rig.calibration.projector_centre)
     lit = lit_points(origin, directions, hits, light, scene.bodies, scene.field)
-    albedo = _albedo(scene, hits, directions, origin, shape)
-    return _shaded(rig, scene, optics, directions, hits, lit, albedo, shape, margin, spill)
+    prints = {
+        index: Footprints(material.albedo, scene.bodies[index], directions, origin, shape[1])
+        for index, material in enumerate(scene.materials)
+        if isinstance(material.albedo, Picture | Discs)
+    }
+    albedo = _albedo(scene, hits, prints)
+    gain = _print_gain(prints, hits, albedo.reshape(shape), optics.camera_blur_sigma_px, margin)
+    return _shaded(rig, scene, optics, directions, hits, lit, albedo, gain, shape, margin, spill)
 
 
 def white_level(rig: Rig, optics: Optics) -> float:
@@ -91,14 +100,25 @@ def _directions(camera: Lens, grid: Array) -> Array:
     return directions
 
 
-def _albedo(scene: Scene, hits: Hits, directions: Array, origin: Array, shape: tuple[int, ...]) -> Plane:
+def _albedo(scene: Scene, hits: Hits, prints: dict[int, Footprints]) -> Plane:
     """(N,) float32 albedo of what each pixel sees, averaged over its footprint where it is printed."""
-    plain = [0.0 if isinstance(m.albedo, Picture | Discs) else m.albedo for m in scene.materials]
+    plain = [0.0 if index in prints else m.albedo for index, m in enumerate(scene.materials)]
     albedo = np.append(np.asarray(plain, dtype=np.float32), np.float32(0.0))[hits.body]
-    for index, material in enumerate(scene.materials):
-        if isinstance(material.albedo, Picture | Discs):
-            footprint_albedo(material.albedo, scene.bodies[index], hits.body, index, directions, origin, shape, albedo)
+    for index, footprints in prints.items():
+        own = np.flatnonzero(hits.body == index)
+        albedo[own] = footprints.means(own)[:, 0, 0]
     return albedo
+
+
+def _print_gain(prints: dict[int, Footprints], hits: Hits, albedo: Plane, blur_px: float, margin: int) -> Plane | None:
+    """Of all prints; see `View`."""
+    if not margin or blur_px <= 0 or not prints:
+        return None
+    gain = np.ones((albedo.shape[0] - 2 * margin, albedo.shape[1] - 2 * margin), dtype=np.float32)
+    body = hits.body.reshape(albedo.shape)
+    for index, footprints in prints.items():
+        print_gain(albedo, body == index, blur_px, footprints, gain)
+    return gain
 
 
 def _shaded(
@@ -109,6 +129,7 @@ def _shaded(
     hits: Hits,
     lit: NDArray[np.bool_],
     albedo: Plane,
+    gain: Plane | None,
     shape: tuple[int, ...],
     margin: int,
     spill: int,
@@ -145,7 +166,7 @@ def _shaded(
         xyz=np.ascontiguousarray(xyz.reshape(*shape, 3)[own]),
         lit=np.ascontiguousarray(lit.reshape(shape)[own]),
     )
-    return View(row, column, shade, floor, truth, margin)
+    return View(row, column, shade, floor, gain, truth, margin)
 
 
 @kernel

@@ -115,7 +115,9 @@ class World:
         if self._steps:
             options = replace(options, pose=(options.pose + self._steps) % POSES)
         beyond = len(self._taps) - 1, spill_px(self._sigma)
-        return _view(s.rig, s.scene, options, seed, o.projector_falloff, o.vignetting, o.ambient, *beyond)
+        return _view(
+            s.rig, s.scene, options, seed, o.projector_falloff, o.vignetting, o.ambient, o.camera_blur_sigma_px, *beyond
+        )
 
     @property
     def _pose(self) -> tuple[int, ...]:
@@ -172,6 +174,7 @@ class World:
             key=(self.settings.shared.seed, number, *self._pose),
             out=out,
             max_value=top,
+            gain=self.view.print_gain,
         )
 
     def arriving(self, start_ns: int, exposure_ns: int, readout_ns: int) -> Plane:
@@ -267,11 +270,12 @@ def _view(
     falloff: float,
     vignetting: float,
     ambient: float,
+    blur_px: float,
     margin: int,
     spill: int,
 ) -> View:
     """A view, kept for the worlds that follow: a rig's daemon opens the same scene again and again."""
-    optics = Optics(projector_falloff=falloff, vignetting=vignetting, ambient=ambient)
+    optics = Optics(projector_falloff=falloff, vignetting=vignetting, ambient=ambient, camera_blur_sigma_px=blur_px)
     chosen = rig(rig_name)
     return view_scene(chosen, build_scene(scene, options, chosen, seed), optics, margin=margin, spill=spill)
 
