@@ -37,6 +37,7 @@ from scanner.calibration.verification import (
     target_ends,
 )
 from scanner.capture import Capture
+from scanner.contrast import sigma_z_that_scatters
 from scanner.errors import DecodeError, ScannerError
 from scanner.geometry import Calibration, load_calibration
 from scanner.scan import Scan
@@ -53,6 +54,9 @@ FEW_USED = 0.9
 board that fills the scan it is 99.9 %"""
 NOISE_OF = {"flatness_mm": "noise_mm", "form_mm": "noise_mm", "shell_mm": "shell_noise_mm"}
 """What a figure is called that noise alone would make of a perfect feature"""
+
+BY_PIXEL = ("pmp", "gray+pmp")
+"""Methods that decode each pixel by itself: others have cells or stripes in common with their neighbours"""
 
 
 @dataclass(frozen=True)
@@ -83,12 +87,12 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
     rig, why = rig_of(folder, scan, given)
     if wanted.flat:
         board = board_points(scan.xyz)
-        found["flat"] = plain(measured_board(board)) | _of_noise(board, scan, BOARD)
+        found["flat"] = plain(measured_board(board)) | _of_noise(board, scan, BOARD, rig)
         found["flat"]["uncertainty"] = _spreads(spread_of_figures(board, scan.shape[1], BOARD, rig))
     if wanted.sphere_mm is not None:
         ball = sphere_points(scan.xyz, wanted.sphere_mm)
         spreads = _spreads(spread_of_figures(ball, scan.shape[1], SPHERE, rig))
-        found["sphere"] = plain(measured_sphere(ball, wanted.sphere_mm)) | _of_noise(ball, scan, SPHERE)
+        found["sphere"] = plain(measured_sphere(ball, wanted.sphere_mm)) | _of_noise(ball, scan, SPHERE, rig)
         found["sphere"]["uncertainty"] = {**spreads, "size_mm": spreads["diameter_mm"]}
     if wanted.target is not None:
         seen, ends = target_ends(scan.albedo, scan.xyz, wanted.target)
@@ -174,9 +178,11 @@ def _made_by(rig: Rig, scan: Scan) -> bool:
     return bool(np.median(np.abs(seen - values.reshape(-1)[at])) < SAME_PX + noise)
 
 
-def _of_noise(on: FeaturePoints, scan: Scan, feature: Feature) -> dict[str, Any]:
+def _of_noise(on: FeaturePoints, scan: Scan, feature: Feature, rig: Rig | None) -> dict[str, Any]:
     """Its widths, of a perfect feature in this noise, where the scan has sigmas."""
-    alone = None if scan.sigma_z is None else noise_alone(on, scan.sigma_z, feature)
+    sigma = sigma_z_that_scatters(scan, "y" if rig is None else rig.axis)
+    by_pixel = (scan.report.get("decoder") or {}).get("method") in BY_PIXEL
+    alone = None if sigma is None else noise_alone(on, sigma, feature, independent=by_pixel)
     return {NOISE_OF[name]: None if alone is None else alone[name] for name in feature.widths}
 
 

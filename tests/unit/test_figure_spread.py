@@ -16,8 +16,16 @@ from scanner.calibration.features import spread
 from scanner.calibration.figure_spread import BOARD, SPHERE, Rig, noise_alone, spread_of_figures, spread_of_length
 from scanner.calibration.repeat_spread import half_width
 from scanner.calibration.targets import parse_target
-from scanner.calibration.verification import FeaturePoints, board_figures, board_points, sphere_figures
+from scanner.calibration.verification import (
+    FeaturePoints,
+    board_figures,
+    board_points,
+    sphere_figures,
+    sphere_points,
+)
+from scanner.calibration.verified import _of_noise
 from scanner.capture import CaptureHeader
+from scanner.contrast import sigma_z_that_scatters, widen_at_edges
 from scanner.geometry import calibration_from_dict
 from scanner.patterns import CameraFormat, McpPattern, PatternSequence, ProjectorSize
 from scanner.scan import Scan
@@ -189,6 +197,31 @@ def test_form_and_flatness_of_what_is_perfect_are_those_of_its_noise():
     assert noise_alone(on, sigma, SPHERE)["form_mm"] == pytest.approx(sphere_figures(on.points)["form_mm"], rel=0.1)
     on = board_points(wall())
     assert noise_alone(on, sigma, BOARD)["flatness_mm"] == pytest.approx(5.94 * NOISE_MM, rel=0.1)
+
+
+@pytest.mark.parametrize("form_mm", [0.0, 0.3])
+def test_noise_of_a_ball_is_what_scatters_and_no_pull_and_none_of_its_lobes(form_mm):
+    """Sigmas that are too large by a tenth, wider still at an edge of brightness, and lobes three around the ball."""
+    points, plain = ball()
+    noise = noise_alone(ball_alone(0), plain, SPHERE)["form_mm"]
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    lobes = np.cos(3 * np.arctan2(v - 60, u - 80)) * np.minimum(np.hypot(v - 60, u - 80) / 20, 1)
+    points = points * (1 + form_mm / 2 / 500 * lobes)[..., None]
+    bright = np.where((u // 12) % 2, 90, 30).astype(np.float32)
+    rows = np.where(np.isfinite(points[..., 2]), 0.4 * v + 0.3 * u, np.nan).astype(np.float32)
+    scan = Scan(
+        rows, None, np.full(rows.shape, 0.01, np.float32), None, bright, bright, bright,
+        np.isnan(rows).astype(np.uint8), points.astype(np.float32), 1.1 * plain.astype(np.float32),
+        report={"decoder": {"method": "pmp"}},
+    )  # fmt: skip
+    scan = widen_at_edges(scan, "y")
+    on = sphere_points(scan.xyz, 2 * RADIUS)
+    assert noise_alone(on, scan.sigma_z, SPHERE)["form_mm"] > 2 * noise, "what the pull adds"
+    np.testing.assert_allclose(sigma_z_that_scatters(scan, "y")[scan.decoded], 1.1 * plain[scan.decoded], rtol=1e-3)
+    assert _of_noise(on, scan, SPHERE, None)["noise_mm"] == pytest.approx(noise, rel=0.05)
+    # Of codes and stripes neighbours err alike: what they differ by tells no noise.
+    coded = scan.with_report(decoder={"method": "gray"})
+    assert _of_noise(on, coded, SPHERE, None)["noise_mm"] == pytest.approx(1.1 * noise, rel=0.05)
 
 
 def test_length_of_a_target_is_as_sure_as_the_baseline_and_the_places_of_its_marks():
