@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -30,6 +31,10 @@ from scanner.patterns import CameraFormat, McpPattern, PatternSequence, Projecto
 LEAST_DECIDED = 0.55
 """Share of the peaks of a pattern that is turned that have a name: nearly .7 and more in sound scenes, .46 and less
 where coins, dim and glossy scenes make stripes of the other way"""
+
+ANOTHER_SHAPE = 0.3
+"""Natural logarithm by which a shape that the search took is not the one that is known: keystone takes less, and those
+tried are two apart"""
 
 
 def decode_image(
@@ -152,7 +157,8 @@ def _see(
     seen = None if known is None else _by_what_is_known(upright, model, camera, known, crossings)
     if seen is not None and known is not None:
         return seen, known
-    seen = _see_anew(upright, model, camera, crossings)
+    told = None if calibration is None else _pixel_shape(calibration, pattern)
+    seen = _see_anew(upright, model, camera, crossings, told)
     return seen, _learnt(seen.found, seen.decided, upside_down=seen.upside_down)
 
 
@@ -179,30 +185,43 @@ def _by_what_is_known(
     return _Seen(image, found, decided, model, known.upside_down, clock)
 
 
-def _see_anew(upright: Image, model: PatternModel, camera: CameraFormat, crossings: Crossings | None) -> _Seen:
+def _pixel_shape(calibration: Calibration, pattern: McpPattern) -> float:
+    """How large the camera sees the projector's pixels along the stripes, over across them."""
+    x, y = calibration.camera_scale
+    return x / y if pattern.axis == "y" else y / x
+
+
+def _see_anew(
+    upright: Image, model: PatternModel, camera: CameraFormat, crossings: Crossings | None, told: float | None
+) -> _Seen:
+    """told: see `_pixel_shape`; None without a calibration."""
     clock = Stages()
-    found = locate(upright, model, camera, clock)
-    if found.fault is not None:
-        _explain(found, upright, model, camera)
-    first, decided = found, decide(found, model, clock, crossings)
-    if decided.agreement.holds:
-        return _Seen(upright, found, decided, model, False, clock)
+    first = locate(upright, model, camera, clock)
+    by_another = first.search is not None and abs(math.log(first.search.aspect / (told or 1.0))) > ANOTHER_SHAPE
+    if first.fault is not None and (told is None or first.search is None):
+        _explain(first, upright, model, camera)
+    decided = decide(first, model, clock, crossings) if first.fault is None else None
+    if decided is not None and decided.agreement.holds:
+        return _Seen(upright, first, decided, model, False, clock)
     # The projector may hang upside down: then the stripes' order is reversed.
     reversed_image = np.ascontiguousarray(upright[::-1])
-    found = locate(reversed_image, model, camera, clock)
-    over = None if crossings is None else turned_over(crossings, len(upright))
-    again = decide(found, model, clock, over) if found.fault is None else decided
-    if again.agreement.holds:
-        return _Seen(reversed_image, found, again, model, True, clock)
-    if first.search is not None and first.search.aspect != 1:
+    over, again = None if crossings is None else turned_over(crossings, len(upright)), decided
+    if decided is not None and (found := locate(reversed_image, model, camera, clock)).fault is None:
+        again = decide(found, model, clock, over)
+        if again.agreement.holds:
+            return _Seen(reversed_image, found, again, model, True, clock)
+    if by_another or first.fault is not None:
         # Harmonics of print may outshine the carriers, and pass for those of pixels of another shape.
         for image, over_turned in ((upright, False), (reversed_image, True)):
-            found = locate(image, model, camera, clock, aspects=())
+            found = locate(image, model, camera, clock, aspects=(), told=told)
             if found.fault is not None:
                 continue
-            square = decide(found, model, clock, over if over_turned else crossings)
-            if square.agreement.holds:
-                return _Seen(image, found, square, model, over_turned, clock)
+            shaped = decide(found, model, clock, over if over_turned else crossings)
+            if shaped.agreement.holds:
+                return _Seen(image, found, shaped, model, over_turned, clock)
+    if decided is None or again is None:
+        _explain(first, upright, model, camera)
+        raise AssertionError("_explain raises")
     _refuse_turned(upright, model, camera)
     a = max(decided.agreement, again.agreement, key=lambda agreement: (agreement.tells, agreement.agree))
     said, figures, hint = _of_codes(a, first, model, camera)

@@ -28,6 +28,10 @@ Image = NDArray[Any]
 MIN_CONTRAST = 1.25
 """Least ratio of a carrier's amplitude to what lies between the carriers, in the mean over the channels."""
 
+TOLD_CONTRAST = 1.1
+"""The same where a calibration tells the shape of the projector's pixels, so that print cannot choose another one: what
+its codes are worth shows when they are decoded."""
+
 PLAIN_CONTRAST = 1.5
 """Contrast at which no other pitch is tried: noise and texture alone stay below 1.2."""
 
@@ -149,6 +153,7 @@ def locate(
     clock: Stages,
     known: Known | None = None,
     aspects: tuple[float, ...] = ASPECTS,
+    told: float | None = None,
 ) -> Found:
     """Find stripes and carriers.
 
@@ -159,6 +164,7 @@ def locate(
         clock: takes the stages' times.
         known: of a frame before: no pitch and no carriers are searched then.
         aspects: shapes of the projector's pixels that are tried besides square ones.
+        told: their shape, where a calibration tells it; no other is tried then.
 
     Returns:
         what was found; its `fault` says why there is no pattern, if there is none.
@@ -179,12 +185,15 @@ def locate(
     with clock.stage("pitch"):
         candidates = stripes.estimate_pitch(found.reduced, model, PITCHES_TRIED)
     best: Found | None = None
+    least = MIN_CONTRAST if told is None else TOLD_CONTRAST
     for pitch, match in candidates:
-        trial = _search(replace(found, pitch=pitch, match=match), image, model, camera, clock)
+        trial = _search(
+            replace(found, pitch=pitch, match=match), image, model, camera, clock, told or 1.0, least_contrast=least
+        )
         if trial.plain:
             return trial
         best = trial if best is None or trial.rank > best.rank else best
-    for aspect in aspects:
+    for aspect in aspects if told is None else ():
         pitch, match = candidates[0]
         trial = _search(replace(found, pitch=pitch, match=match), image, model, camera, clock, aspect)
         if trial.plain:
@@ -194,7 +203,14 @@ def locate(
 
 
 def _search(
-    found: Found, image: Image, model: PatternModel, camera: CameraFormat, clock: Stages, aspect: float = 1.0
+    found: Found,
+    image: Image,
+    model: PatternModel,
+    camera: CameraFormat,
+    clock: Stages,
+    aspect: float = 1.0,
+    *,
+    least_contrast: float = MIN_CONTRAST,
 ) -> Found:
     """Stripes and carriers at one candidate's pitch, the projector's pixels `aspect` times as wide as high."""
     if found.match < MIN_PITCH_MATCH:
@@ -235,7 +251,7 @@ def _search(
             carriers.search_carriers(found.signals, found.tracks, model, around, shape), aspect=aspect
         )
     found.contrast = float(np.exp(np.log(np.maximum(found.search.contrast, 0.1)).mean()))
-    if found.contrast < MIN_CONTRAST:
+    if found.contrast < least_contrast:
         shown = ", ".join(f"{c:.2f}" for c in found.search.contrast)
         found.fault = f"stripes {found.pitch:.1f} px apart, but not the carriers described (contrasts {shown})"
         found.hint = "check bits and carriers of the description, and focus"
