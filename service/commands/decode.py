@@ -94,6 +94,8 @@ def decode(
         options = DecodeOptions.from_dict({**chosen, "correct_ripple": correct_ripple})
         opened = Capture.open(capture)
         lens_file = calibration_for(opened, calibration)
+        # Of a folder that is still being recorded frames are not lost, but still to come.
+        lost = None if opened.header.state == "open" else opened.lost
         folder = output or opened.path / "scan"
         new = [not_there(made_here) for made_here in (stages, folder) if made_here is not None]
         observer: StageFolder | None = None
@@ -102,9 +104,13 @@ def decode(
             if stages is not None:
                 observer = StageFolder(prepare_output(stages, force=force))
             made = reconstruct(opened, lens_file, options, lines.stage, observer)
+            if lost is not None:
+                made = made.with_report(warnings=[lost, *made.report["warnings"]])
             lines.stage("writing files")
             made.save(folder)
         except BaseException:
+            if lost is not None:
+                lines.note(lost)
             # The stages up to a failure stay: they are what it is looked for with.
             if observer is not None and observer.written:
                 lines.note(f"stages up to the failure: {stages}")

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from scanner.capture.header import FrameRecord, digest
 from scanner.patterns import PatternSequence, ProjectorSize
 from scanner.scan import load_scan
 from service import cli
@@ -179,6 +180,27 @@ def test_patterns_seen_pixel_by_pixel_decode_to_their_rows(run: Run, capture: Pa
     status, _, err = run("decode", capture)
     assert status == 1
     assert "not empty" in err
+
+
+def test_decode_says_which_frame_is_lost_and_what_is_to_blame(run: Run, capture: Path) -> None:
+    content = json.loads((capture / "capture.json").read_text())
+    names = content.pop("frames")
+    frames = np.stack([cv2.imread(str(capture / name), cv2.IMREAD_UNCHANGED) for name in names])
+    np.save(capture / "frames.npy", frames)
+    told = ["0" * 16 if k == 3 else digest(frame) for k, frame in enumerate(frames)]
+    lines = [json.dumps(FrameRecord(k, k, xxh3=xxh3).as_dict()) + "\n" for k, xxh3 in enumerate(told)]
+    (capture / "frames.jsonl").write_text("".join(lines))
+    said = f"frame 3 of {len(frames)} lost: the pixels of {capture / 'frames.npy'}, slot 3, are not those that the "
+    for state, warns in (("complete", True), ("open", False)):
+        (capture / "capture.json").write_text(json.dumps({**content, "state": state}))
+        status, out, _ = run("decode", capture, "-o", state, "--json")
+        assert status == 0
+        assert any(said in one for one in json.loads(out)["report"]["warnings"]) == warns
+    (capture / "frames.jsonl").write_text("".join(line.replace(told[2], "1" * 16) for line in lines))
+    (capture / "capture.json").write_text(json.dumps(content))
+    status, _, err = run("decode", capture, "-o", "without-two")
+    assert status == 1
+    assert f"frames 2, 3 of {len(frames)} lost: the pixels of" in err
 
 
 def test_audit_of_a_capture_without_stamps_proves_nothing(run: Run, capture: Path, tmp_path: Path) -> None:
