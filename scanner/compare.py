@@ -83,6 +83,8 @@ class Comparison:
     """pixels with a decoded value that the projector does not light"""
     outside_lit_share: float
     """of all decided pixels"""
+    unlit_points: int
+    """points that are in neither region, since the truth has no light, or nothing, there"""
     period_px: float | None
     """finest period that half of which counts as wrong; None: only depth was judged"""
     error: Map
@@ -99,6 +101,7 @@ class Comparison:
             "inside_px": INSIDE_PX,
             "outside_lit": self.outside_lit,
             "outside_lit_share": self.outside_lit_share,
+            "unlit_points": self.unlit_points,
             "period_px": self.period_px,
         }
 
@@ -163,6 +166,7 @@ def compare(scan: Scan, truth: Truth, period_px: float | None = None) -> Compari
         inside=region(lit & inside(truth)),
         outside_lit=outside,
         outside_lit_share=outside / max(int(decided.sum()), 1),
+        unlit_points=int((there & ~lit).sum()),
         period_px=period_px,
         error=np.where(truth.lit, main, np.nan).astype(np.float32),
         unit="mm" if depth is not None else "px",

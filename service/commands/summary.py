@@ -77,7 +77,7 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     if (rms := error.get("rms")) is not None and (p99 := error.get("p99")) is not None:
         away = f" ({truth['inside_px']} px and more from edges)" if "inside_px" in truth else ""
         facts.append(("depth error", f"{rms:.3f} mm rms, {p99:.3f} mm in 99 of 100 points{away}"))
-        facts += _everywhere(truth.get("lit") or {})
+        facts += _everywhere(truth)
     if (wrong := inside.get("wrong")) is not None:
         everywhere = (truth.get("lit") or {}).get("wrong")
         more = f"; {everywhere:,} with those at edges" if everywhere not in (None, wrong) else ""
@@ -85,13 +85,15 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     return facts
 
 
-def _everywhere(lit: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The depth error of all points, with those at edges, where few that are wrong make most of it."""
+def _everywhere(truth: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The depth error of all points that are lit, with those at edges, where few that are wrong make most of it."""
+    lit: Mapping[str, Any] = truth.get("lit") or {}
     error = lit.get("depth_mm") or {}
     if (rms := error.get("rms")) is None or (p99 := error.get("p99")) is None:
         return []
     wrong = f", {lit['wrong_share']:.2%} of them wrong" if "wrong_share" in lit else ""
-    return [("", f"{rms:.3f} mm rms, {p99:.3f} mm in 99 of 100 points (all that is lit, edges too{wrong})")]
+    unlit = f"; not the {count:,} that the truth has no light for" if (count := truth.get("unlit_points")) else ""
+    return [("", f"{rms:.3f} mm rms, {p99:.3f} mm in 99 of 100 points (all that is lit, edges too{wrong}{unlit})")]
 
 
 def _coverage(report: Mapping[str, Any]) -> list[tuple[str, str]]:

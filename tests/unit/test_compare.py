@@ -62,6 +62,7 @@ def test_values_where_no_light_falls_are_counted(ball, scan):
     truth = Truth(ball.truth.rows, ball.truth.columns, ball.truth.xyz, lit)
     found = compare(scan, truth)
     assert found.outside_lit == ball.lit[:20].sum()
+    assert found.unlit_points == np.isfinite(scan.xyz[:20, :, 2]).sum() > 0
     assert found.outside_lit_share == pytest.approx(found.outside_lit / ball.lit.sum())
     assert found.lit.lit == lit.sum()
 

@@ -46,6 +46,7 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
         },
         "truth": {
             "inside_px": 7,
+            "unlit_points": 1234,
             "inside": {"depth_mm": depth, "wrong": 0},
             "lit": {"wrong": 12, "wrong_share": 0.0012, "depth_mm": {"rms": 0.683, "p99": 0.4}},
         },
@@ -57,7 +58,8 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "1 of the pattern, 1 white, 1 black, 6 black and white around them that prove the timing, 2 times" in printed
     assert "99.0% of the pixels in which the pattern shows, 20.0% keep a point" in printed
     assert "(7 px and more from edges)" in printed
-    assert "0.683 mm rms, 0.400 mm in 99 of 100 points (all that is lit, edges too, 0.12% of them wrong)" in printed
+    assert "0.683 mm rms, 0.400 mm in 99 of 100 points (all that is lit, edges too, 0.12% of them wrong; " in printed
+    assert "wrong; not the 1,234 that the truth has no light for)" in printed
     assert "+-0.16 mm at 700 mm, of 95 in 100 points" in printed
     assert "the median one +-0.14 mm: +-0.14 mm random, +-0.034 mm systematic, mostly noise (k = 2)" in printed
     assert "unknown, and not in it: calibration" in printed
