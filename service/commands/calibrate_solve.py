@@ -23,6 +23,9 @@ TARGET_HELP = (
     "acircles:COLSxROWS:MM[:DIAM], wedge:FILE."
 )
 
+DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+"""As they stand in a lens"""
+
 
 class Model(StrEnum):
     """What is fitted."""
@@ -215,6 +218,9 @@ def _show(solution: Solution, content: dict[str, Any], output: Path, drawing: Pa
 def _facts(
     solution: Solution, content: dict[str, Any], output: Path, drawing: Path | None
 ) -> Sequence[tuple[str, Any]]:
+    import numpy as np  # noqa: PLC0415
+
+    from scanner.calibration.lens_slopes import vector_of  # noqa: PLC0415
     from scanner.calibration.solve import sigmas  # noqa: PLC0415
 
     state, spread = solution.state, sigmas(solution.adjusted)
@@ -228,6 +234,12 @@ def _facts(
                 f"axis at {_stated(m[0, 2], s[2])}, {_stated(m[1, 2], s[3])} px",
             )
         )
+        if lens.distortion.any():
+            numbers = zip(DISTORTION, lens.distortion, s[4:], strict=True)
+            facts.append(("", "distortion " + ", ".join(f"{name} {_stated(v, e)}" for name, v, e in numbers)))
+    turn = np.degrees(vector_of(state.rotation))
+    told = ", ".join(_stated(v, e) for v, e in zip(turn, np.degrees(spread["rotation"]), strict=True))
+    facts.append(("rotation", f"{told} degrees, the vector about which the projector is turned"))
     shift, s = state.translation, spread["translation"]
     scale = content["scale"]
     relative = "; relative to the target's stated size: scale unverified" if scale == "unverified" else ""

@@ -12,7 +12,7 @@ import pytest
 
 from scanner.calibration.adjustment import Equations, adjust
 from scanner.calibration.calibration_file import as_text, calibration_dict, residuals_of
-from scanner.calibration.lens_slopes import lens_numbers
+from scanner.calibration.lens_slopes import lens_numbers, vector_of
 from scanner.calibration.observe import LeftOut, Observation
 from scanner.calibration.panel import SIZE, ticks
 from scanner.calibration.pictures import HEAD_PX, draw
@@ -138,6 +138,13 @@ def test_scale_is_the_stated_length_or_unverified(solution: Solution, capsys: py
     assert re.search(r"sheet +scale x \d\.\d+ \+- 0\.\d+, scale y \d\.\d+ \+- 0\.\d+ of its nominal size, bow", shown)
     twice = 2 * sigmas(solution.adjusted)["camera"][0]
     assert f"focal {with_uncertainty(solution.state.camera.matrix[0, 0], twice)}, " in shown
+    turn, spread = np.degrees(vector_of(solution.state.rotation)), 2 * np.degrees(sigmas(solution.adjusted)["rotation"])
+    assert re.search(rf"rotation +{re.escape(with_uncertainty(turn[0], spread[0]))}, .* degrees, the vector", shown)
+    bent = zip(("k1", "k2", "p1", "p2", "k3"), solution.state.projector.distortion, strict=True)
+    told = [
+        with_uncertainty(v, 2 * e) for (_, v), e in zip(bent, sigmas(solution.adjusted)["projector"][4:], strict=True)
+    ]
+    assert f"distortion k1 {told[0]}, k2 {told[1]}, p1 {told[2]}, p2 {told[3]}, k3 {told[4]}" in shown
     assert "unverified" not in shown
     longer = calibrate(TARGET, observations(RIG, poses(6)), SolveOptions(length=(240.48, 0.01)))
     assert np.linalg.norm(longer.state.translation) == pytest.approx(1.002 * np.linalg.norm(RIG.translation), rel=5e-4)
