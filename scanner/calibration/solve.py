@@ -6,6 +6,7 @@ that cannot be is an error.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -90,6 +91,8 @@ class Solution:
     warm_up: Mapping[str, list[float]] = field(default_factory=dict)
     """see `warm_up_of`, of the captures used"""
     extra: Mapping[str, Any] = field(default_factory=dict)
+    widened: float = 1.0
+    """how many times its formal sigmas those of the covariance are, by `HeldOut.inflation`"""
 
     @property
     def state(self) -> State:
@@ -162,6 +165,7 @@ def solve(
         observations[0].response,
         (taken[0], taken[-1]) if taken else ("", ""),
         warm_up_of(served),
+        widened=math.sqrt(held_out.inflation),
     )
     return replace(solution, warnings=tuple(warnings + _warnings(solution) + warnings_of(served)))
 

@@ -26,6 +26,11 @@ TARGET_HELP = (
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 """As they stand in a lens"""
 
+SUREST = 1e-7
+"""1-sigma of a length, as a share of it, that nothing betters: gauge blocks are calibrated to that by interferometry"""
+NOTABLE_WIDENING = 1.05
+"""From where on uncertainties are said to be wider: one more digit than they are printed with"""
+
 
 class Model(StrEnum):
     """What is fitted."""
@@ -149,6 +154,11 @@ def length_given(text: str) -> tuple[float, float]:
         raise typer.BadParameter(f"--length: expected MM or MM:SIGMA, got {text!r}") from error
     if not (0 < values[0] < 1e6 and 0 < values[1] < values[0]):
         raise typer.BadParameter(f"--length: {text!r} is no length with its uncertainty")
+    if values[1] < SUREST * values[0]:
+        raise typer.BadParameter(
+            f"--length: nothing measures {values[0]:g} mm to {values[1]:g} mm (1-sigma): a caliper has some 0.02 mm, a "
+            f"coordinate measuring machine 0.001 mm; the least that is taken is {SUREST * values[0]:.1g} mm"
+        )
     return values
 
 
@@ -247,7 +257,7 @@ def _facts(
     facts.append(("translation", f"{told} mm{relative}"))
     facts.append(("sheet", _sheet(solution)))
     if content["covariance"] is not None:
-        facts.append(("+-", "expanded uncertainty, k = 2, of each of these figures"))
+        facts.append(("+-", f"expanded uncertainty, k = 2, of each of these figures{_widened(solution.widened)}"))
     residuals = content["residuals"]
     for name, of in (
         ("camera", "distances of points seen from points predicted"),
@@ -263,6 +273,16 @@ def _facts(
     )
     facts.append(("file", output))
     return facts if drawing is None else [*facts, ("picture", drawing)]
+
+
+def _widened(times: float) -> str:
+    """Why uncertainties are larger than residuals and the stated length alone make them; nothing where they are not."""
+    if times < NOTABLE_WIDENING:
+        return ""
+    return (
+        f"; all are {times:.1f} times what residuals and stated length make of them, that of the scale too: by so much "
+        "more the rig moves when views are left out"
+    )
 
 
 def _sheet(solution: Solution) -> str:
