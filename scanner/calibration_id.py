@@ -20,4 +20,7 @@ def id_warnings(content: Mapping[str, Any], name: str) -> list[str]:
     told = content.get("id")
     if not isinstance(told, str) or not re.fullmatch(r"[0-9a-f]{16}", told) or told == content_id(content):
         return []
-    return [f"{name}: its id {told} is not that of its contents: edited by hand? Points rest on what it says now"]
+    return [
+        f"{name}: its id {told} is not that of its contents: edited by hand? What is made with it now rests on "
+        "what it says now"
+    ]

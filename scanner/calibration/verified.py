@@ -23,6 +23,7 @@ from scanner.calibration.figure_spread import (
     spread_of_figures,
     spread_of_length,
 )
+from scanner.calibration.markers import of_another_kind
 from scanner.calibration.marks import Marks, measured_marks
 from scanner.calibration.targets import Target
 from scanner.calibration.verification import (
@@ -46,8 +47,9 @@ from scanner.stated_length import stated_length_of
 SIMULATED = "simulated-"
 """Begins the ids of calibrations that are the true ones of simulated rigs; one that is changed gets its hash"""
 SAME_PX = 0.05
-"""Projector px by which points may miss their coordinates under the scan's own calibration: float32 leaves a
-thousandth. Points of both axes lie between the two: noise, as it is stated, comes on top."""
+"""Px by which points may miss their pixels of the camera, and their projector's coordinates, under the scan's own
+calibration: float32 leaves a thousandth. Points of both axes lie between the two: noise, as it is stated, comes on
+top."""
 
 FEW_USED = 0.9
 """Share of a scan's points that features explain, below which a board's figures may be of a part of it: of a plain
@@ -78,13 +80,15 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
         folder: of the scan. given: a calibration file to take in place of its capture's.
 
     Raises:
-        DecodeError: the scan has no points, or none of a feature.
+        DecodeError: the scan has no points, or none of a feature; the edge lies beyond the picture.
         CalibrationError: the calibration file given cannot be read, or is not the scan's.
     """
     if scan.xyz is None:
         raise DecodeError(f"{folder} has no points", hint="decode it with a calibration: fringed decode --calibration")
     found: dict[str, Any] = {}
     rig, why = rig_of(folder, scan, given)
+    if wanted.edge is not None:
+        _require_within(wanted.edge, scan)
     if wanted.flat:
         board = board_points(scan.xyz)
         found["flat"] = plain(measured_board(board)) | _of_noise(board, scan, BOARD, rig)
@@ -101,7 +105,9 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
         found["length"]["uncertainty"] = {"error_mm": of_length, "measured_mm": of_length}
     if found:
         found["coverage_factor"], found["unknown"] = COVERAGE_FACTOR, why
-        found["warnings"] = _warnings(found)
+        another = None if wanted.target is None else of_another_kind(scan.albedo, wanted.target)
+        kept = () if rig is None or given is not None else rig.calibration.warnings
+        found["warnings"] = [*_warnings(found), *filter(None, [another]), *kept]
         found["stated_length"] = None if rig is None or why is not None else _of_stated(found, rig)
     if wanted.edge is not None:
         x, y, width, height = wanted.edge
@@ -109,6 +115,18 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
     if wanted.marks is not None:
         found["marks"] = measured_marks(wanted.marks, scan.albedo, scan.xyz)
     return found
+
+
+def _require_within(part: tuple[int, int, int, int], scan: Scan) -> None:
+    """Raise DecodeError for a part of the picture that reaches beyond it."""
+    x, y, width, height = part
+    rows, columns = scan.shape
+    if x + width > columns or y + height > rows:
+        raise DecodeError(
+            f"--edge {x},{y},{width},{height} reaches to column {x + width - 1} and row {y + height - 1}, and the "
+            f"scan's picture ends at {columns - 1} and {rows - 1}",
+            hint="X,Y is the upper left corner, W,H the width and height, camera pixels counted from 0",
+        )
 
 
 def _warnings(found: dict[str, Any]) -> list[str]:
@@ -142,7 +160,7 @@ def rig_of(folder: Path, scan: Scan, given: Path | None = None) -> tuple[Rig | N
     axis = calibration.phase_axis if scan.rows is not None and scan.columns is not None else None
     rig = Rig(calibration, axis or ("y" if scan.rows is not None else "x"))
     if not _made_by(rig, scan):
-        return None, f"the scan's points were not made by calibration {calibration.id or given}"
+        return None, f"the scan's points were not made by calibration {calibration.id or given} as it stands"
     if calibration.extra.get("covariance") is None:
         simulated = calibration.id.startswith(SIMULATED)
         return rig, f"the calibration has no covariance{' (the true one of a simulated rig)' if simulated else ''}"
@@ -164,7 +182,7 @@ def _kept(folder: Path, scan: Scan) -> Calibration | None:
 
 
 def _made_by(rig: Rig, scan: Scan) -> bool:
-    """Whether points are seen by the projector where their coordinates say."""
+    """Whether points are seen by the camera at their pixels, and by the projector where their coordinates say."""
     values, sigmas = (scan.rows, scan.sigma_rows) if rig.axis == "y" else (scan.columns, scan.sigma_columns)
     if scan.xyz is None or values is None or scan.shape != rig.calibration.camera.size[::-1]:
         return False
@@ -173,6 +191,10 @@ def _made_by(rig: Rig, scan: Scan) -> bool:
         return False
     at = there[np.linspace(0, there.size - 1, min(200, there.size)).astype(np.intp)]
     points = scan.xyz.reshape(-1, 3)[at]
+    pixels = np.stack((at % scan.shape[1], at // scan.shape[1]), axis=1)
+    missed = np.linalg.norm(rig.calibration.camera.project(points.astype(np.float64)) - pixels, axis=1)
+    if not np.median(missed) < SAME_PX:
+        return False
     seen = rig.calibration.projector.project(rig.calibration.to_projector(points))[:, 1 if rig.axis == "y" else 0]
     noise = 0.0 if sigmas is None else float(np.nanmedian(sigmas.reshape(-1)[at]))
     return bool(np.median(np.abs(seen - values.reshape(-1)[at])) < SAME_PX + noise)

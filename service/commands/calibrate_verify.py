@@ -75,14 +75,17 @@ def verify(
       fringed calibrate verify block/ --edge 600,300,60,200
       fringed calibrate verify today/ --marks marks.json
     """
+    if length is not None and target is None:
+        raise typer.BadParameter(
+            "--length is how long a target's longest row was measured to be: give --target, too (a sphere's diameter "
+            "is --sphere)"
+        )
     known = any(given is not None for given in (sphere, target, marks))
     if not (flat or repeat or known or edge is not None):
         raise typer.BadParameter("nothing to verify: give --flat, --sphere, --target, --edge, --marks or --repeat")
     if tolerance is not None and not (flat or repeat or known):
         raise typer.BadParameter("--tolerance is for errors, and the width of an edge is none")
     part = None if edge is None else region_given(edge, "--edge")
-    if length is not None and target is None:
-        raise typer.BadParameter("--length is the length of a target's longest row: give --target too")
     if repeat:
         _refuse_twice(scans)
     with progress_lines() as lines:

@@ -43,6 +43,33 @@ def _of_widths(one: dict[str, Any]) -> list[tuple[str, str]]:
     return lines
 
 
+def _of_sizes(one: dict[str, Any]) -> list[tuple[str, str]]:
+    """The size of a ball of stated diameter, by its name in the norm."""
+    if one.get("sphere", {}).get("size_mm") is None:
+        return []
+    found = one["sphere"]
+    shown = with_uncertainty(
+        found["size_mm"], found["uncertainty"]["size_mm"]["expanded"], _known(one, "sphere", "size_mm")
+    )
+    stated = found["diameter_mm"] - found["size_mm"]
+    return [("probing size PS", f"{shown} mm, VDI/VDE 2634-2, measured less the stated {stated:g} mm: {one['scan']}")]
+
+
+def _of_positions(document: dict[str, Any]) -> list[tuple[str, str]]:
+    """That figures which norms define are no test by a norm."""
+    if not any(kind in one for one in document["scans"] for kind in ("flat", "sphere")):
+        return []
+    count = len(document["scans"])
+    scans = "one scan is one position" if count == 1 else f"{count} scans are {count} positions at most"
+    return [
+        (
+            "positions",
+            f"{scans}, and no acceptance test: by VDI/VDE 2634-2 that has sphere and board at several, all over the "
+            "measuring volume, and distances between spheres besides, and its largest errors count",
+        )
+    ]
+
+
 def _beyond(width: float, noise: float, expanded: float | None, known: float, kind: str) -> str:
     """What a width has beyond that of noise, in quadrature, as normal deviations add up; U: the width's, carried on."""
     feature = "board" if kind == "flat" else "sphere"
@@ -143,7 +170,7 @@ def show(document: dict[str, Any], worst: Error | None) -> None:
         names = list(dict.fromkeys(name for _, values in rows for name in values))
         cells = ([scan, *(values.get(name, "-") for name in names)] for scan, values in rows)
         print_table(kind, ("scan", *(name.replace("_", " ") for name in names)), cells)
-    facts = [line for one in document["scans"] for line in _of_widths(one)]
+    facts = [line for one in document["scans"] for line in (*_of_widths(one), *_of_sizes(one))]
     facts += _of_repeats(document.get("repeatability"))
     if worst is not None:
         facts.append(("largest error", f"{worst.words}, as measured"))
@@ -151,7 +178,7 @@ def show(document: dict[str, Any], worst: Error | None) -> None:
         if "coverage_factor" in one:
             facts.append(("+-", f"{_of_uncertainty(one)}: {one['scan']}"))
         facts.append(("systematic", f"{_of_systematic(one['systematic_besides'])}: {one['scan']}"))
-    print_facts("verification", facts)
+    print_facts("verification", [*facts, *_of_positions(document)])
     # Of the scan whose figure it dominates most: twenty notes say no more than one.
     stated = [one["stated_length"] for one in document["scans"] if one.get("stated_length") is not None]
     if (hint := dominates(max(stated, key=lambda found: float(found["share"]), default=None))) is not None:

@@ -1,0 +1,85 @@
+"""What `fringed calibrate verify` says of arguments that do not fit, and of figures that are no test by a norm."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from scanner.calibration.detection import charuco_board
+from scanner.calibration.markers import markers_in, of_another_kind
+from scanner.calibration.targets import parse_target
+from scanner.calibration_id import content_id
+from service.cli import main
+from tests.unit.test_calibration_verification import ball, board, save
+from tests.unit.test_figure_spread import ball as ball_of_rig
+from tests.unit.test_figure_spread import rig
+from tests.unit.test_figure_spread import save as save_of_rig
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> str:
+    shown = capsys.readouterr()
+    return " ".join((shown.out + shown.err).split())
+
+
+def test_arguments_that_do_not_fit_are_told_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = str(save(tmp_path / "board", board(0.02)))
+    for words in ([], ["--flat"]):
+        assert main(["calibrate", "verify", folder, "--length", "240", *words]) == 2
+        assert "--length is how long a target's longest row was measured to be: give --target" in said(capsys)
+    for edge, ends in (("500,300,60,20", "column 559 and row 319"), ("100,10,80,50", "column 179 and row 59")):
+        assert main(["calibrate", "verify", folder, "--edge", edge]) == 1
+        assert f"--edge {edge} reaches to {ends}, and the scan's picture ends at 159 and 119" in said(capsys)
+
+
+def test_size_is_called_by_its_norm_and_one_position_no_acceptance_test(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders = [str(save(tmp_path / name, ball(noise_mm=0.01))) for name in ("one", "two")]
+    assert main(["calibrate", "verify", folders[0], "--sphere", "49.9"]) == 0
+    shown = said(capsys)
+    assert "probing size PS 0.101 +- unknown mm, VDI/VDE 2634-2, measured less the stated 49.9 mm" in shown
+    assert "one scan is one position, and no acceptance test: by VDI/VDE 2634-2" in shown
+    assert main(["calibrate", "verify", *folders, "--sphere", "49.9"]) == 0
+    assert "2 scans are 2 positions at most, and no acceptance test" in said(capsys)
+
+
+def test_a_calibration_that_was_edited_makes_no_points_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def edited(**changes: Any) -> dict[str, Any]:
+        content = rig()
+        content["id"] = content_id(content)
+        return {**content, **changes}
+
+    name = edited()["id"]
+    save_of_rig(tmp_path / "a", *ball_of_rig(), name)
+    file = tmp_path / "a" / "capture" / "calibration.json"
+    lens = {**rig()["camera"], "matrix": [[303, 0, 80], [0, 300, 60], [0, 0, 1]]}
+    surer = {**rig()["covariance"], "matrix": [[0.0, 0.0], [0.0, 1e-9]]}
+    for changes, words in (
+        ({}, "expanded uncertainty, k = 2"),
+        ({"covariance": surer}, "edited by hand? What is made with it now rests on what it says now"),
+        ({"camera": lens}, f"the scan's points were not made by calibration {name} as it stands"),
+    ):
+        file.write_text(json.dumps(edited(**changes)))
+        assert main(["calibrate", "verify", str(tmp_path / "a"), "--sphere", "120"]) == 0
+        shown = said(capsys)
+        assert words in shown
+        assert ("edited by hand" in shown) == ("covariance" in changes)
+
+
+def test_a_chessboard_with_markers_is_a_charuco_board() -> None:
+    board_with, chess = parse_target("charuco:10x7:30"), parse_target("chessboard:9x6:30")
+    picture = cv2.copyMakeBorder(charuco_board(board_with).generateImage((600, 420)), 40, 40, 40, 40, 0, value=255)
+    assert markers_in(picture) == 35
+    words = of_another_kind(picture, chess)
+    assert words is not None
+    assert "35 ArUco markers are in the scan" in words
+    assert "charuco:10x7:30" in words
+    assert of_another_kind(picture, board_with) is None
+    y, x = np.mgrid[:420, :600] // 60
+    plain = np.where((x + y) % 2, 235, 20).astype(np.uint8)
+    assert of_another_kind(cv2.copyMakeBorder(plain, 40, 40, 40, 40, 0, value=255), chess) is None
