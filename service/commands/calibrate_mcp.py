@@ -85,8 +85,11 @@ def _facts(fit: McpPhase, pitch: float, line: str) -> list[tuple[str, Any]]:
         ("verdict", f"{verdict} ({allowed})"),
         ("line", f"{line} = ({shown['slope']}) x stripe + ({shown['intercept']})"),
         ("ideal", f"{line} = {pitch:.5f} x stripe + {pitch / 2 - 0.5:.4f}"),
-        ("deviation", f"{shown['deviation_px']} {line}s from the ideal line, at the stripe where it is largest"),
-        ("scatter", f"{shown['rms_px']} {line}s rms of the peaks about the line"),
+        (
+            "deviation",
+            f"{shown['deviation_px']} {line}s from the ideal line, at the stripe where it is largest: to quote",
+        ),
+        ("scatter", f"{shown['rms_px']} {line}s rms of the peaks about the line: how far a single peak goes astray"),
         ("peaks", f"{fit.peaks:,} on {fit.stripes} stripes; {_outliers(fit)}"),
         ("+-", "expanded uncertainty, k = 2, by how much the stripes differ"),
     ]

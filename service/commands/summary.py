@@ -150,7 +150,7 @@ def _uncertainty(budget: Mapping[str, Any]) -> tuple[str, str] | None:
             "median point); the method's own error is not known and larger: see docs/explanation/uncertainty.md"
         )
     else:
-        text = f"+-{within} mm {at}, of 95 in 100 points; {_of_median(budget)}"
+        text = f"+-{within} mm {at}, of 95 in 100 points: the one to quote; {_of_median(budget)}"
     return "uncertainty", f"{text}{f'; unknown, and not in it: {unknown}' if unknown else ''}"
 
 

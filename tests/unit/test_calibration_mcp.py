@@ -120,6 +120,7 @@ def test_mcp_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     said = capsys.readouterr()
     assert re.search(r"row = \(2[67]\.\d+ \+- 0\.\d+\) x stripe \+ \(1[23]\.\d+ \+- 0\.\d+\)", said.out)
     assert "verdict    good (at most 0.2 rows of deviation and of scatter, 5% outliers are allowed)" in said.out
+    assert "at the stripe where it is largest: to quote" in " ".join(said.out.split())
     assert "differ" not in said.err
     off = str(save(tmp_path / "off", None, rows=rows + np.float32(0.4)))
     assert main(["calibrate", "mcp", off, str(single)]) == 0

@@ -101,7 +101,8 @@ def test_what_a_method_adds_unknown_gets_no_figure_of_the_whole(
     (tmp_path / "report.json").write_text(json.dumps(report), encoding="utf-8")
     report_result(tmp_path, 1.0, {}, as_json=False)
     printed = capsys.readouterr().out
-    assert "+-0.20 mm at 700 mm, of 95 in 100 points; the median one +-0.14 mm: +-0.14 mm random (k = 2); " in printed
+    assert "+-0.20 mm at 700 mm, of 95 in 100 points: the one to quote; the median one +-0.14 mm: +-0.14" in printed
+    assert "+-0.14 mm random (k = 2); unknown, and not in it: calibration, print" in printed
     assert "unknown, and not in it: calibration, print" in printed
     assert "systematic" not in printed, "nothing is known of it: that is no 0"
 
