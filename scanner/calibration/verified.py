@@ -58,7 +58,8 @@ NOISE_OF = {"flatness_mm": "noise_mm", "form_mm": "noise_mm", "shell_mm": "shell
 """What a figure is called that noise alone would make of a perfect feature"""
 
 BY_PIXEL = ("pmp", "gray+pmp")
-"""Methods that decode each pixel by itself: others have cells or stripes in common with their neighbours"""
+"""Methods that decode each pixel by itself. Others' sigmas are of cells, or of relief between stripes, which are no
+noise: a simulated board would be said to have 1.6 (Gray code) and 6 times (MCP) the flatness by noise that it has"""
 
 
 @dataclass(frozen=True)
@@ -201,10 +202,10 @@ def _made_by(rig: Rig, scan: Scan) -> bool:
 
 
 def _of_noise(on: FeaturePoints, scan: Scan, feature: Feature, rig: Rig | None) -> dict[str, Any]:
-    """Its widths, of a perfect feature in this noise, where the scan has sigmas."""
-    sigma = sigma_z_that_scatters(scan, "y" if rig is None else rig.axis)
+    """Its widths, of a perfect feature in this noise, where that is known."""
     by_pixel = (scan.report.get("decoder") or {}).get("method") in BY_PIXEL
-    alone = None if sigma is None else noise_alone(on, sigma, feature, independent=by_pixel)
+    sigma = sigma_z_that_scatters(scan, "y" if rig is None else rig.axis) if by_pixel else None
+    alone = None if sigma is None else noise_alone(on, sigma, feature, independent=True)
     return {NOISE_OF[name]: None if alone is None else alone[name] for name in feature.widths}
 
 
