@@ -13,7 +13,9 @@ import pytest
 from scanner.calibration.detection import charuco_board
 from scanner.calibration.markers import markers_in, of_another_kind
 from scanner.calibration.targets import parse_target
+from scanner.calibration.verified import Wanted, verified
 from scanner.calibration_id import content_id
+from scanner.scan import load_scan
 from service.cli import main
 from tests.unit.test_calibration_verification import ball, board, save
 from tests.unit.test_figure_spread import ball as ball_of_rig
@@ -71,7 +73,7 @@ def test_a_calibration_that_was_edited_makes_no_points_anew(tmp_path: Path, caps
         assert ("edited by hand" in shown) == ("covariance" in changes)
 
 
-def test_a_chessboard_with_markers_is_a_charuco_board() -> None:
+def test_a_chessboard_with_markers_is_a_charuco_board(tmp_path: Path) -> None:
     board_with, chess = parse_target("charuco:10x7:30"), parse_target("chessboard:9x6:30")
     picture = cv2.copyMakeBorder(charuco_board(board_with).generateImage((600, 420)), 40, 40, 40, 40, 0, value=255)
     assert markers_in(picture) == 35
@@ -80,6 +82,10 @@ def test_a_chessboard_with_markers_is_a_charuco_board() -> None:
     assert "35 ArUco markers are in the scan" in words
     assert "charuco:10x7:30" in words
     assert of_another_kind(picture, board_with) is None
+    v, u = np.mgrid[: picture.shape[0], : picture.shape[1]] / 2.0
+    folder = save(tmp_path / "target", np.stack((u, v, np.full(u.shape, 700.0)), axis=-1), picture.astype(np.float32))
+    for described, warned in ((chess, [words]), (board_with, [])):
+        assert verified(folder, load_scan(folder), Wanted(target=described))["warnings"] == warned
     y, x = np.mgrid[:420, :600] // 60
     plain = np.where((x + y) % 2, 235, 20).astype(np.uint8)
     assert of_another_kind(cv2.copyMakeBorder(plain, 40, 40, 40, 40, 0, value=255), chess) is None
