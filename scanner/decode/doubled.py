@@ -10,7 +10,7 @@ rotated as a whole leaves nothing at any number (`rotated`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, product
 from typing import Any
 
@@ -27,6 +27,8 @@ from scanner.decode.frame_orders import (
     left_beside_overtones,
     orders_of,
     orders_without,
+    owed,
+    trembles,
 )
 from scanner.decode.pmp_frames import AxisFrames
 from scanner.decode.pmp_sample import Sample
@@ -146,7 +148,7 @@ class _Seen:
 
 def misplaced_frames(frames: AxisFrames, sample: Sample) -> list[Misplaced]:
     """What is wrong with the sets that have all their frames."""
-    at = _lit_pixels(sample, frames)
+    at = lit_pixels(sample, frames)
     if at.size < LEAST_PIXELS:
         return []
     seen = _read(frames, at)
@@ -157,13 +159,10 @@ def misplaced_frames(frames: AxisFrames, sample: Sample) -> list[Misplaced]:
             found += _of_three(k, seen)
         elif k in verdicts:
             found += verdicts[k].found(min((v.noise for j, v in verdicts.items() if j != k), default=None))
-    late = {one.of_set: one.late for one in found}
-    # Of all sets the steps between them do not always tell.
-    all_late = any(all(late.get(k) == by for k in verdicts) for by in (1, -1))
-    return [replace(one, mended=False) for one in found] if all_late else found
+    return found
 
 
-def _lit_pixels(sample: Sample, frames: AxisFrames) -> NDArray[np.intp]:
+def lit_pixels(sample: Sample, frames: AxisFrames) -> NDArray[np.intp]:
     """(p,) indices of pixels of the sample, MOST_PIXELS at the most."""
     counts = np.array([max(len(have), 1) for have in frames.there], np.float32) / 2
     power = np.tensordot(counts, sample.modulations**2, 1) + sample.residual
@@ -296,7 +295,7 @@ class _Verdict:
         if self._shifts > 4:
             known = orders_without(self._shifts)
             left = [(order, left_beside_overtones(self._samples, order)) for order in known.orders]
-            orders = self._best(before, left, self._freedom - 1)
+            orders = tuple(one for one in self._best(before, left, self._freedom - 1) if self._owes_nothing(one))
         like = {n: source for n in range(self._shifts) if (source := _like(self._k, n, self._seen)) is not None}
         if not orders and len(like) == 1:
             orders = tuple(Order.of(self._shifts, {n: NONE}) for n in like)
@@ -311,10 +310,21 @@ class _Verdict:
         beyond = before - self._freedom * noise, least - freedom * noise
         if before - least < LEAST_SHARE * self._least or beyond[1] > EXPLAINED * beyond[0]:
             return ()
-        if not self._stands_out(before, noise, share):
+        best = next(order for order, after in left if after == least)
+        if not self._stands_out(before, noise, share) or trembles(self._samples, best):
             return ()
         equal = EQUALLY * (before - least) + EQUALLY_NOISE * freedom * noise + EQUALLY_BEYOND * max(beyond[1], 0.0)
         return tuple(order for order, after in left if after == least or after - freedom * noise < equal)
+
+    def _owes_nothing(self, order: Order) -> bool:
+        """Whether the false frame's fringe is not that which the others have there, weaker, stronger or moved."""
+        (n,) = order.false
+        others = np.delete(np.arange(self._shifts), n)
+        turns = 2 * np.pi / self._shifts * np.arange(self._shifts)
+        design = np.stack([np.ones_like(turns), np.cos(turns), np.sin(turns)], axis=1)
+        level, *heights = np.linalg.pinv(design[others]) @ self._samples[others]
+        due = design[n, 1:] @ np.array(heights)
+        return not owed(due, self._samples[n] - level)
 
     def _several_alike(self, before: float) -> tuple[Order, ...]:
         """Orders with each of two frames that show the same in place of the other, two such pairs or three."""

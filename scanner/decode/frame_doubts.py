@@ -37,7 +37,7 @@ def may_be_doubled(
     Args:
         sample: without what overtones are of its residuals. residual: (R, L), with it.
     """
-    if 3 in frames.shifts and (any(map(_contradicts, steps)) or not _all_differ(frames)):
+    if {3, 4} & set(frames.shifts) and (any(map(_contradicts, steps)) or not _all_differ(frames)):
         return True
     least = _least(frames.shifts)
     return least > 0 and _stands_out(
@@ -52,7 +52,8 @@ def _least(shifts: tuple[int, ...]) -> float:
 
 
 def _contradicts(step: Remainder) -> bool:
-    return step.pixels >= MIN_PIXELS and (step.agreement < MIN_AGREEMENT or step.beyond_noise > MOST_SYSTEMATIC / 2)
+    # Noise that frames out of step have made may leave no pixel to be asked.
+    return step.pixels < MIN_PIXELS or step.agreement < MIN_AGREEMENT or step.beyond_noise > MOST_SYSTEMATIC / 2
 
 
 def _all_differ(frames: AxisFrames) -> bool:

@@ -38,8 +38,18 @@ NEAR = 2
 MOST_SHARES = np.array([0.45, 0.2, 0.15])
 """Of the second, third and fourth overtone in their fringe: gamma 3 gives .4, .05 and less."""
 
-MOST_FLICKER = 0.3
+MOST_FLICKER = 0.5
 """Of a frame's light, and of its fringe: lamps on mains, at exposures that are no whole number of periods"""
+
+OWED = 0.5
+"""Of the fringe that a frame should show: one that shows more of it is in its place, in another light or moved"""
+
+MOST_TREMBLING, MOST_OF_SHIFT = 0.25, 0.25
+"""Radians that a frame's fringe lies beside its place where a scene or a device trembles, and of a shift: frames that
+show other shifts stand in the others' company, and these in their places."""
+
+FEWEST_TREMBLING = 5
+"""Shifts of a set that shows it: of four, the one residual is as good for that as for another order."""
 
 _OVERTONES = (2, 3, 4)
 
@@ -109,6 +119,25 @@ def orders_without(shifts: int) -> Orders:
     return Orders(orders, rests.reshape(shifts, -1))
 
 
+def trembles(samples: NDArray[np.float64], order: Order) -> bool:
+    """Whether frames that an order takes for true lie beside their places, 1-sigma, by a good part of a shift.
+
+    Args:
+        samples: (N, p).
+    """
+    if len(samples) < FEWEST_TREMBLING:
+        return False
+    true = np.array([n not in order.false for n in range(len(samples))])
+    there = np.array(order.shows) != NONE
+    turns = 2 * pi / len(samples) * np.array(order.shows)[there]
+    design = _design(turns)
+    fit, seen = np.linalg.pinv(design), samples[there]
+    across = -np.sin(turns)[:, None] * (fit @ seen)[1] + np.cos(turns)[:, None] * (fit @ seen)[2]
+    onto = np.eye(len(turns)) - design @ fit
+    beside = _bounded(onto * (across @ across.T), np.sum((onto @ seen) * across, axis=1), pi)
+    return float(np.sqrt(np.mean(beside[true[there]] ** 2))) > MOST_OF_SHIFT * 2 * pi / len(samples)
+
+
 def left_beside_overtones(samples: NDArray[np.float64], order: Order) -> float:
     """Mean sum of squares that an order leaves of (N, p) samples, once overtones and flicker are fitted, too.
 
@@ -129,11 +158,25 @@ def left_beside_overtones(samples: NDArray[np.float64], order: Order) -> float:
     for share, shape in zip(shares, shapes, strict=True):
         rest -= share * shape
     onto = np.eye(len(turns)) - design @ fit
-    for light in (design @ (fit @ seen), np.broadcast_to(level, seen.shape)):
-        grams = onto * (light @ light.T)
-        changes = _bounded(grams, np.sum(rest * light, axis=1), MOST_FLICKER)
-        rest -= onto @ (changes[:, None] * light)
+    across = -height * np.sin(angles)
+    kinds: list[tuple[NDArray[np.float64], float]] = [
+        (design @ (fit @ seen), MOST_FLICKER),
+        (np.broadcast_to(level, seen.shape), MOST_FLICKER),
+    ]
+    if len(there) >= FEWEST_TREMBLING:
+        # What drifts, by as much from frame to frame, and what trembles.
+        steady = onto @ ((np.flatnonzero(there) - np.flatnonzero(there).mean())[:, None] * across)
+        rest -= float(np.vdot(steady, rest)) / max(float(np.vdot(steady, steady)), 1e-9) * steady
+        kinds.append((across, min(MOST_TREMBLING, MOST_OF_SHIFT * 2 * pi / len(there))))
+    for kind, most in kinds:
+        changes = _bounded(onto * (kind @ kind.T), np.sum(rest * kind, axis=1), most)
+        rest -= onto @ (changes[:, None] * kind)
     return float(np.mean(np.sum(rest**2, axis=0)))
+
+
+def owed(due: NDArray[np.float64], seen: NDArray[np.float64]) -> bool:
+    """Whether what is seen is the fringe that is due, weaker, stronger or moved, both without their mean."""
+    return float(np.vdot(due, seen)) > OWED * float(np.vdot(due, due))
 
 
 def _bounded(

@@ -12,6 +12,7 @@ that shows what another one of its set shows is left out, and named (`doubled`).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -30,7 +31,9 @@ from scanner.decode import (
     spectra,
 )
 from scanner.decode.agreement import disagreements, doubtful_counts
-from scanner.decode.doubled import Misplaced, misplaced_frames
+from scanner.decode.between_sets import Disorder, disorders, exchange, faults_of_all, faults_of_few, told_of
+from scanner.decode.doubled import lit_pixels, misplaced_frames
+from scanner.decode.drifting import drift_of, miscounts, moved
 from scanner.decode.field_end import FieldEnd, heights_of, mind_ends
 from scanner.decode.frames import FrameCheck
 from scanner.decode.lone_set import require_fringes
@@ -189,20 +192,41 @@ class PmpDecoder:
     def _decoded_in_step(self, axis: Axis, brief: bool) -> AxisFound:
         """Decode one axis, without the frames of it that are found to show what they should not."""
         found = self._decoded_axis(axis, brief)
-        faults = self._misplaced(axis, found)
-        if all(fault.mended for fault in faults):
-            found = self._decoded_axis(axis, brief) if faults else found
-            frequencies, shifts = self._pattern.frequencies, self._pattern.shifts
-            if not (rotated := rotated_sets(found.ladder, found.remainders, shifts)):
-                return found
+        for look in (self._all_late, self._misplaced, self._disordered):
+            mended = look(axis, found) if found.may_be_doubled else None
+            if mended is not None:
+                if not mended:
+                    return self._without_values(axis, found, brief)
+                found = self._decoded_axis(axis, brief)
+        frequencies, shifts = self._pattern.frequencies, self._pattern.shifts
+        if found.may_be_doubled and (drift := self._drift(axis, found)):
+            self._doubled.append(moved(axis, drift))
+            return self._without_values(axis, found, brief, Reason.MOVED)
+        if rotated := rotated_sets(found.ladder, found.remainders, shifts):
             self._doubled += out_of_step(axis, rotated, frequencies, shifts)
-        self._ends[axis] = None
-        return undecided(found)
+            return self._without_values(axis, found, brief)
+        return found
 
-    def _misplaced(self, axis: Axis, found: AxisFound) -> list[Misplaced]:
-        """What is wrong with an axis's frames: mended where it can be, and kept to be told."""
-        if not found.may_be_doubled:
-            return []
+    def _without_values(
+        self, axis: Axis, found: AxisFound, brief: bool, reason: Reason = Reason.OUT_OF_STEP
+    ) -> AxisFound:
+        self._ends[axis] = None
+        return undecided(found, reason, None if brief else self._thresholds, self._camera.max_value)
+
+    def _drift(self, axis: Axis, found: AxisFound) -> float | None:
+        """Projector px a frame by which a scene drifts, where fringes are counted wrong for that; else None."""
+        frames = axis_frames(self._pattern, axis, self._frames)
+        drift = drift_of(self._pattern, frames, lit_pixels(found.sample, frames))
+        if drift is None or not miscounts(found.ladder, self._pattern.frequencies, self._pattern.shifts, drift):
+            return None
+        return drift * self._sequence.projector.along(axis)
+
+    def _all_late(self, axis: Axis, found: AxisFound) -> bool | None:
+        """Whether frames that are out of step were put in it; None where none is found to be. Of the whole sequence."""
+        return self._told(axis, found, faults_of_all)
+
+    def _misplaced(self, axis: Axis, found: AxisFound) -> bool | None:
+        """The same, of frames that their own sets tell."""
         sets = [s for s in self._pattern.sets() if s.axis == axis]
         faults = misplaced_frames(axis_frames(self._pattern, axis, self._frames), found.sample)
         shifts, ladder = self._pattern.shifts, found.ladder
@@ -214,7 +238,26 @@ class PmpDecoder:
             told = fault.says(lambda k, n: self._sequence.fringes[sets[k].first + n])
             self._doubled.append(f"frequency {sets[fault.of_set].frequency:g} along {axis}: {told}; capture again")
             fault.mend(self._frames, sets[fault.of_set].first)
-        return faults
+        return all(fault.mended for fault in faults) if faults else None
+
+    def _disordered(self, axis: Axis, found: AxisFound) -> bool | None:
+        """The same, of frames that steps between sets tell."""
+        return self._told(axis, found, faults_of_few)
+
+    def _told(self, axis: Axis, found: AxisFound, faults: Callable[[Sequence[int]], Iterable[Disorder]]) -> bool | None:
+        """Look for faults, keep what there is to be told, and put frames in step where that can be done."""
+        sets = [s for s in self._pattern.sets() if s.axis == axis]
+        frames = axis_frames(self._pattern, axis, self._frames)
+        at, along = lit_pixels(found.sample, frames), self._sequence.projector.along(axis)
+        these = disorders(faults(frames.shifts), self._pattern, frames, at, found.ladder, along)
+        if not these:
+            return None
+        mended = len(these) == 1 and bool(these[0].exchanged)
+        if mended:
+            exchange(self._frames, *(sets[k].first + n for k, n in these[0].exchanged))
+        told = told_of(these, mended, axis, self._pattern, lambda k, n: self._sequence.fringes[sets[k].first + n])
+        self._doubled.append(f"{told}; capture again")
+        return mended
 
     def _decoded_axis(self, axis: Axis, brief: bool) -> AxisFound:
         frames = axis_frames(self._pattern, axis, self._frames)

@@ -20,7 +20,7 @@ from scanner.decode.cut_at_black import unmove_dark
 from scanner.decode.field_end import far_rooms, margin_px
 from scanner.decode.frame_doubts import may_be_doubled
 from scanner.decode.neighbours import settle
-from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel
+from scanner.decode.noise import ROUNDING_VARIANCE, NoiseModel, default_noise
 from scanner.decode.one_surface import doubt_axis, doubtful_steps
 from scanner.decode.pmp_frames import AxisFrames
 from scanner.decode.pmp_join import join_maps
@@ -265,12 +265,22 @@ def decode_axis(
     )  # fmt: skip
 
 
-def undecided(found: AxisFound) -> AxisFound:
+def undecided(found: AxisFound, why: Reason, thresholds: PmpThresholds | None, max_value: int) -> AxisFound:
     """The same of an axis whose frames were out of step: no pixel with light has a value, and nothing is told of what
-    its frequencies and its light would have been."""
+    its frequencies and its light would have been.
+
+    Args:
+        why: reason of pixels with light. thresholds, max_value: by which fringes pass for light; None where modulations
+            were not asked for. The scan's own noise is not asked: frames out of step have made it.
+    """
     maps, counts = found.maps, np.zeros(REASONS, np.int64)
     there = np.isin(maps.reason, (Reason.VALUE, Reason.UNWRAP_RISK, Reason.BORDER, Reason.MOVED))
-    maps.reason[there] = Reason.OUT_OF_STEP
+    if thresholds is not None:
+        b, noise = maps.modulation, default_noise(max_value)
+        least = max(thresholds.min_modulation_levels, thresholds.min_modulation_share * float(np.percentile(b, 99)))
+        lit = (b >= least) & (b**2 >= thresholds.min_modulation_sigmas**2 * noise.variance(maps.albedo))
+        there |= lit & np.isin(maps.reason, (Reason.SHADOW, Reason.LOW_MODULATION))
+    maps.reason[there] = why
     for values in (maps.position, maps.sigma):
         values.fill(np.nan)
     maps.confidence.fill(0)

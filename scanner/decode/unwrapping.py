@@ -46,6 +46,17 @@ class Ladder:
         """Frequency of each rung over that of the rung before."""
         return np.asarray(self.frequencies[1:] / self.frequencies[:-1])
 
+    def climb(self, turns: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
+        """What phases that are off by `turns`, (sets,) cycles, and nothing else, leave of every step, (rungs - 1,)
+        within half a cycle, and by how many fringes the finest set is counted wrong."""
+        beats = self.combinations @ turns
+        off, left = float(beats[0] - np.rint(beats[0])), []
+        for ratio, beat in zip(self.ratios.tolist(), beats[1:].tolist(), strict=True):
+            order = round(ratio * off - beat)
+            left.append(ratio * off - beat - order)
+            off = beat + order
+        return np.array(left), round(off - float(beats[-1]))
+
     def warnings(self) -> tuple[str, ...]:
         """What a user should know about steps too wide for comfort."""
         return tuple(

@@ -350,7 +350,10 @@ def test_frames_in_a_wrong_order_leave_no_wrong_values(shifts, wrong, gamma):
     decoded = decode(pattern, frames)
     good = np.isfinite(decoded.rows)
     assert np.count_nonzero(np.abs(decoded.rows - surface()[0])[good] > 3) <= 1e-4 * good.size
-    if shifts == 3:
+    if shifts == 3 and gamma == 1.0:
+        assert good.mean() > 0.95
+        assert "changed places, and were taken in each other's place" in decoded.warnings[0]
+    elif shifts == 3:
         assert good.mean() < 0.01
         assert any("do not agree anywhere" in warning for warning in decoded.warnings)
 
