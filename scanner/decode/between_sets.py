@@ -233,7 +233,7 @@ class _Judge:
         others = np.median([fit.level for j, fit in enumerate(self._fits) if j != k], axis=0)
         fit = self._fit(k, [(m, (k, m)) for m in self._there[k] if m != n], others)
         due = design_matrix(self._pattern, self._pattern.shifts[k], (n,))[0, 1:] @ fit.heights
-        return owed(due, self._samples[place] - fit.level)
+        return owed(fit.level, due, self._samples[place])
 
     def _fit(self, k: int, frames: Sequence[tuple[int, Place]], others: NDArray[np.float64] | None = None) -> _Fit:
         """Of the frames at some places, by the shifts that they show. others: other sets' level, for less than three"""

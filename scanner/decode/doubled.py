@@ -23,12 +23,13 @@ from scanner.decode.frame_orders import (
     MOST_SHIFTS,
     NONE,
     Order,
+    beside,
     least_left,
     left_beside_overtones,
+    lies_beside,
     orders_of,
     orders_without,
     owed,
-    trembles,
 )
 from scanner.decode.pmp_frames import AxisFrames
 from scanner.decode.pmp_sample import Sample
@@ -50,6 +51,9 @@ should be it is 1 and noise on top; noise of B / 10 hides a doubled one of eight
 
 UNEXPLAINED = 0.5
 """Of what a doubled neighbour leaves, from where on a set that nothing explains is out of step, if others are not"""
+
+HARMLESS = 0.1
+"""Radians of a set's phase, 1-sigma, that frames beside their places may cost: a sixtieth of a fringe"""
 
 MEDIAN_SQUARE = 0.455
 """Of a normal variable's square, over its mean"""
@@ -263,9 +267,16 @@ class _Verdict:
             orders, source = self._foreign(before)
         if orders:
             return [Misplaced(self._k, self._plain(orders), orders, source)]
-        if noise is not None and min(before, self._typical()) - self._freedom * noise > UNEXPLAINED * self._least:
+        if noise is None or self._trembles_little():
+            return []
+        if min(before, self._typical()) - self._freedom * noise > UNEXPLAINED * self._least:
             return [Misplaced(self._k, False, ())]
         return []
+
+    def _trembles_little(self) -> bool:
+        """Whether frames lie beside their places, and phases are hardly worse for it."""
+        off, left = beside(self._samples, orders_of(self._shifts).orders[0])
+        return left < EXPLAINED and float(np.std(off)) * np.sqrt(2 / self._shifts) < HARMLESS
 
     def _typical(self) -> float:
         """What most pixels have left, as a mean would have it: of what moves, some have much.
@@ -311,7 +322,9 @@ class _Verdict:
         if before - least < LEAST_SHARE * self._least or beyond[1] > EXPLAINED * beyond[0]:
             return ()
         best = next(order for order, after in left if after == least)
-        if not self._stands_out(before, noise, share) or trembles(self._samples, best):
+        if not self._stands_out(before, noise, share):
+            return ()
+        if lies_beside(self._samples, best):
             return ()
         equal = EQUALLY * (before - least) + EQUALLY_NOISE * freedom * noise + EQUALLY_BEYOND * max(beyond[1], 0.0)
         return tuple(order for order, after in left if after == least or after - freedom * noise < equal)
@@ -324,7 +337,7 @@ class _Verdict:
         design = np.stack([np.ones_like(turns), np.cos(turns), np.sin(turns)], axis=1)
         level, *heights = np.linalg.pinv(design[others]) @ self._samples[others]
         due = design[n, 1:] @ np.array(heights)
-        return not owed(due, self._samples[n] - level)
+        return not owed(level, due, self._samples[n])
 
     def _several_alike(self, before: float) -> tuple[Order, ...]:
         """Orders with each of two frames that show the same in place of the other, two such pairs or three."""

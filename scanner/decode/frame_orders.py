@@ -45,8 +45,12 @@ OWED = 0.5
 """Of the fringe that a frame should show: one that shows more of it is in its place, in another light or moved"""
 
 MOST_TREMBLING, MOST_OF_SHIFT = 0.25, 0.25
-"""Radians that a frame's fringe lies beside its place where a scene or a device trembles, and of a shift: frames that
-show other shifts stand in the others' company, and these in their places."""
+"""Radians that a frame's fringe lies beside its place where a scene or a device trembles, and of a shift, at the most:
+what is beyond is not taken for that alone"""
+
+TRUSTED = 0.15
+"""Of a shift, 1-sigma, that frames lie beside their places where an order is believed: of frames that tremble more one
+in some hundreds lies nearer to another's place than to its own."""
 
 FEWEST_TREMBLING = 5
 """Shifts of a set that shows it: of four, the one residual is as good for that as for another order."""
@@ -119,23 +123,36 @@ def orders_without(shifts: int) -> Orders:
     return Orders(orders, rests.reshape(shifts, -1))
 
 
-def trembles(samples: NDArray[np.float64], order: Order) -> bool:
-    """Whether frames that an order takes for true lie beside their places, 1-sigma, by a good part of a shift.
+def beside(samples: NDArray[np.float64], order: Order) -> tuple[NDArray[np.float64], float]:
+    """How far frames lie beside what an order has them show, radians; and the share of what it leaves that is left once
+    they are taken for lying there.
 
     Args:
-        samples: (N, p).
+        samples: (N, p), of FEWEST_TREMBLING shifts or more; of fewer nothing is known, 0 and 1.
+
+    Returns:
+        (n,), of the frames that show anything.
     """
-    if len(samples) < FEWEST_TREMBLING:
-        return False
-    true = np.array([n not in order.false for n in range(len(samples))])
     there = np.array(order.shows) != NONE
     turns = 2 * pi / len(samples) * np.array(order.shows)[there]
+    if len(samples) < FEWEST_TREMBLING:
+        return np.zeros(len(turns)), 1.0
     design = _design(turns)
-    fit, seen = np.linalg.pinv(design), samples[there]
-    across = -np.sin(turns)[:, None] * (fit @ seen)[1] + np.cos(turns)[:, None] * (fit @ seen)[2]
-    onto = np.eye(len(turns)) - design @ fit
-    beside = _bounded(onto * (across @ across.T), np.sum((onto @ seen) * across, axis=1), pi)
-    return float(np.sqrt(np.mean(beside[true[there]] ** 2))) > MOST_OF_SHIFT * 2 * pi / len(samples)
+    _, cosine, sine = np.linalg.pinv(design) @ samples[there]
+    across = np.cos(turns)[:, None] * sine - np.sin(turns)[:, None] * cosine
+    onto = np.eye(len(turns)) - design @ np.linalg.pinv(design)
+    rest = onto @ samples[there]
+    off = _bounded(onto * (across @ across.T), np.sum(rest * across, axis=1), pi)
+    after = rest - onto @ (off[:, None] * across)
+    return off, float(np.vdot(after, after) / max(np.vdot(rest, rest), 1e-9))
+
+
+def lies_beside(samples: NDArray[np.float64], order: Order) -> bool:
+    """Whether frames do not show what an order has them show, nor its other frames, but lie somewhere between."""
+    there = np.flatnonzero(np.array(order.shows) != NONE)
+    off, false = np.abs(beside(samples, order)[0]), np.isin(there, order.false)
+    worst = max(float(np.sqrt(np.mean(off[~false] ** 2))), float(off[false].max(initial=0.0)))
+    return worst > TRUSTED * 2 * pi / len(samples)
 
 
 def left_beside_overtones(samples: NDArray[np.float64], order: Order) -> float:
@@ -174,9 +191,11 @@ def left_beside_overtones(samples: NDArray[np.float64], order: Order) -> float:
     return float(np.mean(np.sum(rest**2, axis=0)))
 
 
-def owed(due: NDArray[np.float64], seen: NDArray[np.float64]) -> bool:
-    """Whether what is seen is the fringe that is due, weaker, stronger or moved, both without their mean."""
-    return float(np.vdot(due, seen)) > OWED * float(np.vdot(due, due))
+def owed(level: NDArray[np.float64], due: NDArray[np.float64], seen: NDArray[np.float64]) -> bool:
+    """Whether what a frame shows is the fringe that is due over its level, in another light or moved. (p,) each."""
+    shapes = np.stack([level, due])
+    shares = np.linalg.lstsq(shapes @ shapes.T, shapes @ seen, rcond=None)[0]
+    return bool(shares[1] > OWED)
 
 
 def _bounded(

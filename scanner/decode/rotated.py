@@ -52,7 +52,8 @@ def rotated_sets(ladder: Ladder, steps: Sequence[Remainder], shifts: Sequence[in
     Args:
         steps: of the ladder. shifts: by set, of the pattern.
     """
-    if all(abs(s.offset) < LEAST_OFFSET for s in steps) or not all(map(_alike_everywhere, steps)):
+    apart = [s for s in steps if abs(s.offset) >= LEAST_OFFSET]
+    if not apart or not all(map(_alike_everywhere, apart)) or min(s.pixels for s in steps) < MIN_PIXELS:
         return ()
     seen, most = np.array([s.offset for s in steps]), np.array([_most_apart(s) for s in steps])
     return tuple(
@@ -102,7 +103,7 @@ def _is_hidden(ladder: Ladder, rotated: Rotated, shifts: Sequence[int]) -> bool:
 
 
 def _alike_everywhere(step: Remainder) -> bool:
-    return step.pixels >= MIN_PIXELS and step.agreement >= LEAST_AGREEMENT
+    return step.agreement >= LEAST_AGREEMENT
 
 
 def _most_apart(step: Remainder) -> float:

@@ -12,18 +12,21 @@ SIZE = ProjectorSize(128, 400)
 CAMERA = CameraFormat(160, 120, 8)
 
 
-def captured(shifts, seed=0, noise=1.0, lit=1.0, gain=200.0, frequencies=(1.0, 4.0, 16.0)):
-    """A sequence, its frames of a board of which a share is lit, and the rows seen."""
-    sequence = PatternSequence(SIZE, PmpPattern(("y",), frequencies, (shifts,) * len(frequencies)))
+def captured(shifts, seed=0, noise=1.0, lit=1.0, gain=200.0, frequencies=(1.0, 4.0, 16.0), moves=lambda position: 0.0):
+    """A sequence, its frames of a board of which a share is lit, and the rows seen.
+
+    shifts: of each set, or of all. moves: projector px by which the board lies farther on, by position.
+    """
+    shifts = shifts if isinstance(shifts, tuple) else (shifts,) * len(frequencies)
+    sequence = PatternSequence(SIZE, PmpPattern(("y",), frequencies, shifts))
     rows = 20 + 3.0 * np.arange(CAMERA.height)[:, None] + 0.05 * np.arange(CAMERA.width)
     albedo = np.where(np.arange(CAMERA.width) < lit * CAMERA.width, 1.0, 0.02)
     generator = np.random.default_rng(seed)
     frames = []
     for position in range(len(sequence)):
         light = sequence.image(position)[:, 0] / 255.0
-        grey = (
-            10 + gain * albedo * np.interp(rows, np.arange(SIZE.height), light) + generator.normal(0, noise, rows.shape)
-        )
+        there = np.interp(rows + moves(position), np.arange(SIZE.height), light)
+        grey = 10 + gain * albedo * there + generator.normal(0, noise, rows.shape)
         frames.append(np.clip(np.rint(grey), 0, 255).astype(np.uint8))
     return sequence, frames, rows
 
@@ -173,6 +176,21 @@ def test_what_else_leaves_residuals_is_not_taken_for_frames_out_of_step(kind):
             frames = [np.where(np.arange(CAMERA.width) < n, 200 - frame, frame) for n, frame in enumerate(frames)]
         found = decoded(sequence, [frame.astype(np.uint8) for frame in frames])
         assert not [words for words in found.warnings if "capture again" in words]
+
+
+@pytest.mark.parametrize("shifts", [4, 5, 8, 16])
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("kind", ["flickers", "trembles", "drifts"])
+def test_light_that_flickers_and_boards_that_tremble_or_drift_are_in_step(shifts, seed, kind):
+    generator = np.random.default_rng(seed)
+    places = generator.normal(0, 0.4, 3 * shifts) if kind == "trembles" else 0.04 * np.arange(3 * shifts)
+    moves = (lambda position: 0.0) if kind == "flickers" else places.__getitem__
+    sequence, frames, _ = captured(shifts, gain=130.0, moves=moves)
+    if kind == "flickers":
+        frames = [
+            np.rint(np.clip(frame * (1 + generator.normal(0, 0.15)), 0, 255)).astype(np.uint8) for frame in frames
+        ]
+    assert not [words for words in decoded(sequence, frames).warnings if "capture again" in words]
 
 
 @pytest.mark.parametrize("k", [0, 1, 2])
