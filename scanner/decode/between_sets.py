@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scanner.decode.agreement import remainders_of
 from scanner.decode.frame_orders import owed
 from scanner.decode.pmp_frames import AxisFrames, design_matrix
+from scanner.decode.sample_kernels import MIN_PIXELS
 from scanner.decode.unwrapping import Ladder
 from scanner.patterns import PmpPattern
 
@@ -106,7 +107,7 @@ def disorders(
     Args:
         at: (p,) pixels of a sample with light in them. along: projector pixels along the axis.
     """
-    if not at.size or len(frames.there) < 2:
+    if at.size < MIN_PIXELS or len(frames.there) < 2:
         return ()
     judge = _Judge(pattern, frames, at, ladder, 0.5 + (pattern.origin - 0.5) / along)
     if not judge.scatters:

@@ -31,6 +31,7 @@ from scanner.decode.frame_orders import (
     orders_without,
     owed,
 )
+from scanner.decode.noise import default_noise
 from scanner.decode.pmp_frames import AxisFrames
 from scanner.decode.pmp_sample import Sample
 
@@ -172,7 +173,9 @@ def lit_pixels(sample: Sample, frames: AxisFrames) -> NDArray[np.intp]:
     power = np.tensordot(counts, sample.modulations**2, 1) + sample.residual
     power[~sample.usable] = 0
     top = np.partition(power.reshape(-1), int(0.99 * (power.size - 1)))[int(0.99 * (power.size - 1))]
-    at = (sample.runs[:, None] + np.arange(power.shape[1]))[power > LIT2 * top]
+    # Twice what noise alone makes of as many frames.
+    dark = 2 * sum(map(len, frames.there)) * default_noise(sample.max_value).variance(sample.mean)
+    at = (sample.runs[:, None] + np.arange(power.shape[1]))[power > np.maximum(LIT2 * top, dark)]
     return np.asarray(at[:: max(-(-at.size // MOST_PIXELS), 1)])
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode.pmp_frames import AxisFrames, design_matrix
+from scanner.decode.sample_kernels import MIN_PIXELS
 from scanner.decode.unwrapping import Ladder
 from scanner.patterns import PmpPattern
 
@@ -32,6 +33,8 @@ def drift_of(pattern: PmpPattern, frames: AxisFrames, at: NDArray[np.intp]) -> f
     Args:
         at: (p,) pixels of a sample with light in them.
     """
+    if at.size < MIN_PIXELS:
+        return None
     found = [
         _radians(pattern, frames, at, k) / (2 * np.pi * frequency)
         for k, frequency in enumerate(pattern.frequencies)

@@ -30,15 +30,24 @@ THINNED = 8
 
 
 def may_be_doubled(
-    frames: AxisFrames, sample: Sample, residual: NDArray[np.float32], steps: Sequence[Remainder]
+    frames: AxisFrames,
+    sample: Sample,
+    residual: NDArray[np.float32],
+    steps: Sequence[Remainder],
+    good: NDArray[np.bool_],
 ) -> bool:
-    """Whether the sample's residuals are large enough for a look at the frames; of three shifts, what is left of steps.
+    """Whether the sample's residuals are large enough for a look at the frames; of three shifts and of four, what is
+    left of steps.
 
     Args:
-        sample: without what overtones are of its residuals. residual: (R, L), with it.
+        sample: without what overtones are of its residuals. residual: (R, L), with it. good: of `Look`.
     """
-    if {3, 4} & set(frames.shifts) and (any(map(_contradicts, steps)) or not _all_differ(frames)):
-        return True
+    if {3, 4} & set(frames.shifts):
+        if any(map(_contradicts, steps)) or not _all_differ(frames):
+            return True
+        # Noise that frames out of step have made may leave no pixel to be asked.
+        if any(step.pixels < MIN_PIXELS for step in steps) and np.count_nonzero(good) >= MIN_PIXELS:
+            return True
     least = _least(frames.shifts)
     return least > 0 and _stands_out(
         sample.modulations, sample.usable, residual, sample.residual, sample.phases, least, THINNED
@@ -52,16 +61,17 @@ def _least(shifts: tuple[int, ...]) -> float:
 
 
 def _contradicts(step: Remainder) -> bool:
-    # Noise that frames out of step have made may leave no pixel to be asked.
-    return step.pixels < MIN_PIXELS or step.agreement < MIN_AGREEMENT or step.beyond_noise > MOST_SYSTEMATIC / 2
+    return step.pixels >= MIN_PIXELS and (step.agreement < MIN_AGREEMENT or step.beyond_noise > MOST_SYSTEMATIC / 2)
 
 
 def _all_differ(frames: AxisFrames) -> bool:
     """Whether no two frames of a set of three are the same at a few pixels in the middle."""
     for first, count in zip(frames.starts.tolist(), frames.shifts, strict=False):
+        if count != 3:
+            continue
         few = [frame.reshape(-1) for frame in frames.frames[first : first + 3]]
         middle = few[0].size // 2
-        if count == 3 and len({frame[middle : middle + THREE_SEEN].tobytes() for frame in few}) < 3:
+        if len({frame[middle : middle + THREE_SEEN].tobytes() for frame in few}) < 3:
             return False
     return True
 

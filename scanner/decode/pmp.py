@@ -192,7 +192,7 @@ class PmpDecoder:
     def _decoded_in_step(self, axis: Axis, brief: bool) -> AxisFound:
         """Decode one axis, without the frames of it that are found to show what they should not."""
         found = self._decoded_axis(axis, brief)
-        for look in (self._all_late, self._misplaced, self._disordered):
+        for look in (self._all_late, self._misplaced, *[self._disordered] * len(self._pattern.frequencies)):
             mended = look(axis, found) if found.may_be_doubled else None
             if mended is not None:
                 if not mended:

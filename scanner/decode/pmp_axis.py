@@ -225,7 +225,7 @@ def decode_axis(
         shared.open()
         # What a report tells is no business of the pass: others are in it by now.
         found = remainders(plan.ladder, judged.steps, judged.pixels)
-        doubled = may_be_doubled(frames, sample, residual, found)
+        doubled = may_be_doubled(frames, sample, residual, found, seen.good)
         random_px, ripple, light = np.nan, None, Light((), None)
         if not brief:
             random_px = plan.per_cycle * judged.phase_sigma(finest)
