@@ -3,8 +3,8 @@
 Told from a sample of pixels, set by set: an order of the frames that leaves much less than the one that was meant, and
 no more than noise would (`frame_orders`). Whether a capture is in step is asked with more care, and before anything
 else, by the sequencer's witnesses, which refuse it; this is for frames that come to a decoder without them. With three
-shifts nothing is left but the set's mean light, which a doubled frame changes and an exchange does not. A set that is
-rotated as a whole leaves nothing at any number (`rotated`).
+shifts nothing is left but the set's mean light, which a doubled frame changes and an exchange does not
+(`between_sets`). A set that is rotated as a whole leaves nothing at any number (`rotated`).
 """
 
 from __future__ import annotations
