@@ -122,6 +122,9 @@ def decode_pixels(
     combined = beats.max() >= 2 * sets or (steps > 0 and terms[:, 0].max() >= 2 * sets)
     turns = turns_of(starts, weights, shifts)
     unit = _F1 / np.float32(clip) ** 2
+    per_cycle, turn = scale[0] / scale[3], _F1 / scale[3]
+    widest = max((abs(limits[6]) * per_cycle) * np.sqrt(_PER_TURN2 / limits[1]), limits[7])
+    freedom = max(_F1 / noise[4] - noise[3], _F1)
     line = CACHE_LINE // like.itemsize
     maps = position.ctypes.data | confidence.ctypes.data | sigma.ctypes.data
     aligned = (maps | albedo.ctypes.data | modulation.ctypes.data | (4 * begin)) % CACHE_LINE == 0
@@ -132,7 +135,8 @@ def decode_pixels(
                 expect(addresses, n, at + AHEAD, like)
         _decode_lanes(
             addresses, like, starts, weights, grams, shifts, turns, clip, gains, rungs, ratios, errors, floors, noise,
-            scale, limits, periodic, finest, beats, terms, parts, combined, unit, spot, at, at, aligned,
+            scale, limits, periodic, finest, beats, terms, parts, combined, unit,
+            per_cycle, turn, widest, freedom, spot, at, at, aligned,
             position, sigma, confidence, albedo, modulation, reason, rooms,
         )  # fmt: skip
     if solid < end:
@@ -141,7 +145,8 @@ def decode_pixels(
         copies, last = copies_of(addresses, solid, size, like, spare), aligned_rows(5, LANES)
         _decode_lanes(
             copies, like, starts, weights, grams, shifts, turns, clip, gains, rungs, ratios, errors, floors, noise,
-            scale, limits, periodic, finest, beats, terms, parts, combined, unit, spot, solid, 0, False,
+            scale, limits, periodic, finest, beats, terms, parts, combined, unit,
+            per_cycle, turn, widest, freedom, spot, solid, 0, False,
             last[0], last[1], last[2], last[3], last[4], last_reason, rooms,
         )  # fmt: skip
         keep(spare)
@@ -179,6 +184,10 @@ def _decode_lanes(
     parts: NDArray[np.float32],
     combined: bool,
     unit: np.float32,
+    per_cycle: np.float32,
+    turn: np.float32,
+    widest: np.float32,
+    freedom: np.float32,
     spot: NDArray[np.float32],
     at: int,
     to: int,
@@ -204,24 +213,23 @@ def _decode_lanes(
         if combined:
             combine(spot, rungs, errors, gains, beats, terms)
         absolute, wrong = climb(spot, beats, terms, parts, ratios, floors, scale[2], limits[4], unit, sets, variance)
-    along, origin, fine, low = scale[0], scale[1], scale[3], scale[4] + _HALF
-    cycles = absolute * (_F1 / fine)
+    along, origin, low = scale[0], scale[1], scale[4] + _HALF
+    cycles = absolute * turn
     if periodic:
         # Both ends of a periodic field look alike: whole turns are taken off.
         cycles -= nearest(cycles - low)
     value = cycles * along - origin
     square = load(spot, (sets + finest) * LANES)
-    spread = ((along / fine) ** 2 * gains[finest] * _PER_TURN2) * variance
+    spread = (per_cycle**2 * gains[finest] * _PER_TURN2) * variance
     # Farther from both ends than so many sigmas, without a root: squares that keep their sign.
     edge = limits[6] if periodic else -limits[6]
     first, last = value + _HALF, (along - _HALF) - value
     room = least(first, last)
     # What is lit has a sigma of no more than this; nearly all pixels are farther from the ends than by that.
-    inside = room > max((abs(edge) * along / fine) * np.sqrt(_PER_TURN2 / limits[1]), limits[7])
+    inside = room > widest
     far = all_of(inside)
     if not far:
         inside = (room * magnitude(room)) * square > (edge * abs(edge)) * spread
-    freedom = max(_F1 / shrink - prior, _F1)
     still = residual <= greatest((limits[2] * freedom) * model, (limits[3] * freedom) * square)
     good = inside & lit & still & (wrong <= limits[5]) & clear
     known, why = good, whole(0)

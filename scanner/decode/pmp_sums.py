@@ -48,6 +48,8 @@ thousandth of what any camera's noise does."""
 
 _F0 = np.float32(0)
 _F1 = np.float32(1)
+_F2 = np.float32(2)
+_F4 = np.float32(4)
 _HALF = np.float32(0.5)
 _QUARTER = np.float32(0.25)
 _EIGHTH = np.float32(0.125)
@@ -194,15 +196,17 @@ def fit_lanes(
         if has_quads(like) and count != 0:
             if count == 8:
                 p, q, total, squares, bright = _sum_eight(addresses, like, first, at, squares, bright)
-                scale, part = _LONG_EIGHT, _EIGHTH
+                scale, part, half = _LONG_EIGHT, _EIGHTH, _F4
             else:
                 p, q, total, squares, bright = _sum_four(addresses, like, first, at, squares, bright)
-                scale, part = _QUARTER, _QUARTER
+                scale, part, half = _QUARTER, _QUARTER, _F2
             square = scale * (p * p + q * q) + _TINY
-            a, half = floats(total), _HALF / part
-            sums, level = sums + total, level + part * a
+            a = floats(total)
+            own = part * a
+            sums, level = sums + total, level + own
             dotted += 1
-            residual -= a * (part * a) + half * square
+            residual -= a * own
+            residual -= half * square
         else:
             if count == 8:
                 p, q, scale, own, rest, high = _fit_eight(addresses, like, first, share, at)
