@@ -363,5 +363,5 @@ def _no_sphere(points: Array, on_best: int, diameter_mm: float | None) -> Decode
     return DecodeError(
         f"no sphere of {diameter_mm:g} mm diameter among the points, and none of {OTHER_SIZES[0]:.1f} to "
         f"{OTHER_SIZES[-1]:.1f} times that",
-        hint="keep its surroundings out of the scan: fringed decode --box or --depth",
+        hint="if there is one, keep its surroundings out of the scan: fringed decode --box or --depth",
     )

@@ -60,7 +60,10 @@ def _of_positions(document: dict[str, Any]) -> list[tuple[str, str]]:
     if not any(kind in one for one in document["scans"] for kind in ("flat", "sphere")):
         return []
     count = len(document["scans"])
-    scans = "one scan is one position" if count == 1 else f"{count} scans are {count} positions at most"
+    if document.get("repeatability") is not None:
+        scans = f"{count} scans of one scene are one position"
+    else:
+        scans = "one scan is one position" if count == 1 else f"{count} scans are {count} positions at most"
     return [
         (
             "positions",

@@ -41,13 +41,15 @@ def test_arguments_that_do_not_fit_are_told_as_they_are(tmp_path: Path, capsys: 
 def test_size_is_called_by_its_norm_and_one_position_no_acceptance_test(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folders = [str(save(tmp_path / name, ball(noise_mm=0.01))) for name in ("one", "two")]
+    folders = [str(save(tmp_path / name, ball(noise_mm=noise))) for name, noise in (("one", 0.01), ("two", 0.011))]
     assert main(["calibrate", "verify", folders[0], "--sphere", "49.9"]) == 0
     shown = said(capsys)
     assert "probing size PS 0.101 +- unknown mm, VDI/VDE 2634-2, measured less the stated 49.9 mm" in shown
     assert "one scan is one position, and no acceptance test: by VDI/VDE 2634-2" in shown
     assert main(["calibrate", "verify", *folders, "--sphere", "49.9"]) == 0
     assert "2 scans are 2 positions at most, and no acceptance test" in said(capsys)
+    assert main(["calibrate", "verify", *folders, "--sphere", "49.9", "--repeat"]) == 0
+    assert "2 scans of one scene are one position, and no acceptance test" in said(capsys)
 
 
 def test_a_calibration_that_was_edited_makes_no_points_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
