@@ -141,40 +141,44 @@ def _print() -> NDArray[np.float32]:
 @kernel
 def _means_of_raster(values, mm_per_px, tiled, around, rectangle, pixels, directions, origin, width, means):
     height_px, width_px = values.shape
-    parts = means.shape[1]
     for i in range(pixels.shape[0]):
-        u, v, ax, ay, bx, by = _footprint(rectangle, directions, origin, width, pixels[i])
-        for r in range(parts):
-            for c in range(parts):
-                along, down = (c + 0.5) / parts - 0.5, (r + 0.5) / parts - 0.5
+        whole = _footprint(rectangle, directions, origin, width, pixels[i])
+        for r in range(means.shape[1]):
+            for c in range(means.shape[2]):
+                u, v, ax, ay, bx, by = _part(whole, means.shape[1], r, c)
                 means[i, r, c] = raster_mean(
                     values,
                     tiled,
                     around,
-                    (u + along * ax + down * bx) / mm_per_px + 0.5 * width_px,
-                    (v + along * ay + down * by) / mm_per_px + 0.5 * height_px,
-                    ax / (parts * mm_per_px),
-                    ay / (parts * mm_per_px),
-                    bx / (parts * mm_per_px),
-                    by / (parts * mm_per_px),
+                    u / mm_per_px + 0.5 * width_px,
+                    v / mm_per_px + 0.5 * height_px,
+                    ax / mm_per_px,
+                    ay / mm_per_px,
+                    bx / mm_per_px,
+                    by / mm_per_px,
                 )
 
 
 @kernel
 def _means_of_discs(centres, radius, inside, around, rectangle, pixels, directions, origin, width, means):
-    parts = means.shape[1]
     for i in range(pixels.shape[0]):
-        u, v, ax, ay, bx, by = _footprint(rectangle, directions, origin, width, pixels[i])
-        for r in range(parts):
-            for c in range(parts):
-                along, down = (c + 0.5) / parts - 0.5, (r + 0.5) / parts - 0.5
-                x, y = u + along * ax + down * bx, v + along * ay + down * by
+        whole = _footprint(rectangle, directions, origin, width, pixels[i])
+        for r in range(means.shape[1]):
+            for c in range(means.shape[2]):
+                u, v, ax, ay, bx, by = _part(whole, means.shape[1], r, c)
                 share = 0.0
                 for n in range(centres.shape[0]):
-                    share += disc_share(
-                        x - centres[n, 0], y - centres[n, 1], ax / parts, ay / parts, bx / parts, by / parts, radius
-                    )
+                    share += disc_share(u - centres[n, 0], v - centres[n, 1], ax, ay, bx, by, radius)
                 means[i, r, c] = around + (inside - around) * share
+
+
+@kernel
+def _part(footprint, parts, row, column):
+    """Middle and sides of one of parts x parts of a footprint."""
+    u, v, ax, ay, bx, by = footprint
+    along, down = (column + 0.5) / parts - 0.5, (row + 0.5) / parts - 0.5
+    middle = u + along * ax + down * bx, v + along * ay + down * by
+    return middle[0], middle[1], ax / parts, ay / parts, bx / parts, by / parts
 
 
 @kernel
