@@ -15,7 +15,7 @@ class FrameCheck:
 
     def __init__(self, sequence: PatternSequence, camera: CameraFormat) -> None:
         self._count = len(sequence)
-        self._camera = camera
+        self._camera, self._shape, self._dtype = camera, camera.shape, camera.dtype
         self._seen: set[int] = set()
 
     def take(self, position: int, frame: NDArray[Any]) -> None:
@@ -24,14 +24,15 @@ class FrameCheck:
         Raises:
             DecodeError: no such position, one that was given before, wrong size or dtype.
         """
-        camera = self._camera
         if not 0 <= position < self._count:
             raise DecodeError(f"frame {position} does not exist: the pattern has {self._count} frames")
         if position in self._seen:
             raise DecodeError(f"frame {position} was given before")
-        if frame.shape != camera.shape:
+        if frame.shape != self._shape:
+            camera = self._camera
             size = " x ".join(str(n) for n in reversed(frame.shape))
             raise DecodeError(f"frame {position} is {size} px, the camera's format {camera.width} x {camera.height}")
-        if frame.dtype != camera.dtype:
-            raise DecodeError(f"frame {position} has dtype {frame.dtype}; {camera.bits} bits come as {camera.dtype}")
+        if frame.dtype != self._dtype:
+            bits = self._camera.bits
+            raise DecodeError(f"frame {position} has dtype {frame.dtype}; {bits} bits come as {self._dtype}")
         self._seen.add(position)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from scanner.kernel import kernel
 
-_DIGIT = 11
-_DIGITS = 1 << _DIGIT
+_DIGITS = 1 << 11
+_OCTAVES = 24
 _SIGN = np.uint32(1 << 31)
 _BLOCK = 64
 _COUNTED = 1 << 15
@@ -132,42 +132,35 @@ def middle_of_squares(squares: NDArray[np.float32]) -> np.float32:
 
 @kernel
 def order_of(keys: NDArray[np.float32]) -> NDArray[np.int32]:
-    """(n,) int32: which come first. keys: (n,) float32 without NaN.
+    """(n,) int32: which come first. keys: (n,) float32, 0 or more, without NaN.
 
-    Equal ones keep their order, and so do those that differ by less than a part in four million of the range of their
-    words, which for numbers of one sign is a ten thousandth of themselves at the very most: two rounds do instead of
-    three, and no median of thousands is as good as that.
+    Equal ones keep their order, and so do those that differ by no more than what _DIGITS leave of the octaves between
+    the least and the greatest: a thousandth of themselves over an octave and a half, a percent at the very most, since
+    what lies more than _OCTAVES below the greatest counts as least. One round of sorting does then, and medians of bins
+    of some hundred pixels are no better than that.
     """
-    words, size = _ordered(keys), keys.size
+    words, size = keys.view(np.uint32), keys.size
     low, high = words[0], words[0]
     for i in range(size):
         low, high = min(low, words[i]), max(high, words[i])
+    low = max(low, np.uint32(high - min(high, np.uint32(_OCTAVES << 23))))
     drop = np.uint32(0)
-    while np.uint32(high - low) >> drop >= np.uint32(_DIGITS * _DIGITS):
+    while np.uint32(high - low) >> drop >= np.uint32(_DIGITS):
         drop += np.uint32(1)
-    starts, mask = np.zeros((2, _DIGITS), np.int32), np.uint32(_DIGITS - 1)
-    fine, coarse = starts[0], starts[1]
+    starts, digits, order = np.zeros(_DIGITS, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
     for i in range(size):
-        word = np.uint32(words[i] - low) >> drop
-        words[i] = word
-        fine[word & mask] += 1
-        coarse[word >> np.uint32(_DIGIT)] += 1
-    below_fine, below_coarse = 0, 0
+        digits[i] = np.uint32(max(words[i], low) - low) >> drop
+    for i in range(size):
+        starts[digits[i]] += 1
+    below = 0
     for d in range(_DIGITS):
-        here, there = fine[d], coarse[d]
-        fine[d], coarse[d] = below_fine, below_coarse
-        below_fine += here
-        below_coarse += there
-    by_fine, order = np.empty(size, np.int32), np.empty(size, np.int32)
+        here = starts[d]
+        starts[d] = below
+        below += here
     for i in range(size):
-        d = words[i] & mask
-        by_fine[fine[d]] = i
-        fine[d] += 1
-    for i in range(size):
-        which = by_fine[i]
-        d = words[which] >> np.uint32(_DIGIT)
-        order[coarse[d]] = which
-        coarse[d] += 1
+        d = digits[i]
+        order[starts[d]] = i
+        starts[d] += 1
     return order
 
 

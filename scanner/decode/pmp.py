@@ -79,7 +79,8 @@ class PmpDecoder:
         self._check = FrameCheck(sequence, camera)
         self._fringe_at = {position: fringe for fringe, position in enumerate(sequence.fringes)}
         self._frames: dict[int, NDArray[Any]] = {}
-        self._awaited = dict.fromkeys(self._pattern.axes, sum(self._pattern.shifts))
+        self._each_axis = sum(self._pattern.shifts)
+        self._awaited = dict.fromkeys(self._pattern.axes, self._each_axis)
         self._copies: NDArray[Any] | None = None
         self._maps = {axis: AxisMaps.empty(camera.width * camera.height) for axis in self._pattern.axes}
         self._found: dict[Axis, AxisFound] = {}
@@ -162,12 +163,14 @@ class PmpDecoder:
     def _took(self, fringe: int, frame: NDArray[Any]) -> None:
         self._frames[fringe] = frame
         # An axis that is whole before the last one's frames come is decoded in the meantime.
-        axis = self._pattern.axes[fringe // sum(self._pattern.shifts)]
+        axis = self._pattern.axes[fringe // self._each_axis]
         self._awaited[axis] -= 1
         if not self._awaited[axis] and len(self._frames) < len(self._fringe_at):
             self._decode(axis)
 
     def _missing(self) -> tuple[str, ...]:
+        if len(self._frames) == len(self._fringe_at):
+            return ()
         positions, warnings, lost = self._sequence.fringes, [], []
         for s in self._pattern.sets():
             missing = [positions[n] for n in range(s.first, s.first + s.shifts) if n not in self._frames]

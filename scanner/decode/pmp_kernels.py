@@ -119,6 +119,7 @@ def decode_pixels(
     # Behind phases and B^2 by set: what the ladder combines of sets, a beat for each rung, a spread for each step.
     spot = aligned_rows(2 * sets + 2 * steps + 1, LANES).reshape(-1)
     beats, terms, parts = plan_rows(rungs, errors, gains)
+    even = gains.min() == gains.max()
     combined = beats.max() >= 2 * sets or (steps > 0 and terms[:, 0].max() >= 2 * sets)
     turns = turns_of(starts, weights, shifts)
     unit = _F1 / np.float32(clip) ** 2
@@ -136,7 +137,7 @@ def decode_pixels(
         _decode_lanes(
             addresses, like, starts, weights, grams, shifts, turns, clip, gains, rungs, ratios, errors, floors, noise,
             scale, limits, periodic, finest, beats, terms, parts, combined, unit,
-            per_cycle, turn, widest, freedom, spot, at, at, aligned,
+            per_cycle, turn, widest, freedom, even, spot, at, at, aligned,
             position, sigma, confidence, albedo, modulation, reason, rooms,
         )  # fmt: skip
     if solid < end:
@@ -146,7 +147,7 @@ def decode_pixels(
         _decode_lanes(
             copies, like, starts, weights, grams, shifts, turns, clip, gains, rungs, ratios, errors, floors, noise,
             scale, limits, periodic, finest, beats, terms, parts, combined, unit,
-            per_cycle, turn, widest, freedom, spot, solid, 0, False,
+            per_cycle, turn, widest, freedom, even, spot, solid, 0, False,
             last[0], last[1], last[2], last[3], last[4], last_reason, rooms,
         )  # fmt: skip
         keep(spare)
@@ -188,6 +189,7 @@ def _decode_lanes(
     turn: np.float32,
     widest: np.float32,
     freedom: np.float32,
+    even: bool,
     spot: NDArray[np.float32],
     at: int,
     to: int,
@@ -203,11 +205,11 @@ def _decode_lanes(
     """Decode LANES pixels from `at` on, into the maps from `to` on."""
     sets = gains.size
     v0, slope, least_variance, prior, shrink = noise[0], noise[1], noise[2], noise[3], noise[4]
-    mean, residual, clear = fit_lanes(addresses, like, starts, weights, grams, shifts, turns, clip, at, spot)
+    mean, residual, weakest, clear = fit_lanes(addresses, like, starts, weights, grams, shifts, turns, clip, at, spot)
     model = greatest(v0 + slope * mean, least_variance)
     # A residual can show a pixel to be noisier than the model has it; a small one is luck more often than not.
     variance = greatest((prior * model + residual) * shrink, model)
-    lit = _lit(spot, gains, limits[0] * limits[0], limits[1], variance)
+    lit = _lit(spot, gains, even, weakest, limits[0] * limits[0], limits[1], variance)
     absolute, wrong = floats(_F0), floats(_F1)
     if any_of(lit):
         if combined:
@@ -266,9 +268,17 @@ def _put(row: NDArray[np.float32], to: int, value: Lanes, past_caches: bool) -> 
 
 @inlined_kernel
 def _lit(
-    spot: NDArray[np.float32], gains: NDArray[np.float32], min_b2: np.float32, min_sigmas2: np.float32, variance: Lanes
+    spot: NDArray[np.float32],
+    gains: NDArray[np.float32],
+    even: bool,
+    weakest: Lanes,
+    min_b2: np.float32,
+    min_sigmas2: np.float32,
+    variance: Lanes,
 ) -> Lanes:
-    """Where all sets have enough modulation."""
+    """Where all sets have enough modulation: the weakest, where their gains are the same."""
+    if even:
+        return weakest >= greatest(min_sigmas2 * gains[0] * variance, min_b2)
     lit = _enough(spot, gains, 0, min_b2, min_sigmas2, variance)
     for k in range(1, gains.size):
         lit = lit & _enough(spot, gains, k, min_b2, min_sigmas2, variance)

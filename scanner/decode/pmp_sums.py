@@ -47,6 +47,7 @@ ARCTAN_ERROR_CYCLES = 3.5e-7
 thousandth of what any camera's noise does."""
 
 _F0 = np.float32(0)
+_HUGE = np.float32(np.inf)
 _F1 = np.float32(1)
 _F2 = np.float32(2)
 _F4 = np.float32(4)
@@ -122,7 +123,7 @@ def fit_runs(
                 begin = at
             else:
                 near = addresses
-            a, rest, clear = fit_lanes(near, like, starts, weights, grams, shifts, turns, clip, begin, spot)
+            a, rest, _, clear = fit_lanes(near, like, starts, weights, grams, shifts, turns, clip, begin, spot)
             to, skip = r * length + done, at - begin
             store(spot, (2 * sets + 2) * LANES, choose(clear, _F0, _F1))
             for i in range(size):
@@ -180,15 +181,17 @@ def fit_lanes(
     clip: int,
     at: int,
     spot: NDArray[np.float32],
-) -> tuple[Lanes, Lanes, Lanes]:
-    """Fit all sets at LANES pixels from `at` on: mean of their A, sum of their squared residuals, where nothing clips.
+) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """Fit all sets at LANES pixels from `at` on.
+
+    Mean of their A, sum of their squared residuals, least of their B^2, where nothing clips.
 
     Args:
         spot: (2 K, LANES) and more, flat, float32, written: phases, cycles; B^2.
     """
     sets = starts.size - 1
     share = _F1 / np.float32(sets)
-    mean, residual, top = floats(_F0), floats(_F0), as_samples(0, like)
+    mean, residual, weakest, top = floats(_F0), floats(_F0), floats(_HUGE), as_samples(0, like)
     # Of sets that are fitted in quads: samples' energy and sum from the middle of their range, the brightest.
     squares, sums, bright, level, dotted = whole(0), whole(0), no_quads(), floats(_F0), 0
     for k in range(sets):
@@ -220,6 +223,7 @@ def fit_lanes(
             mean += own
             residual += rest
             top = greatest(top, high)
+        weakest = least(weakest, square)
         store(spot, k * LANES, turns[k, 0] * _phase(p, q) + turns[k, 1])
         store(spot, (sets + k) * LANES, square)
     clear = top < clip
@@ -229,7 +233,7 @@ def fit_lanes(
         residual = greatest(residual + floats(squares - 128 * sums), _F0)
         if any_reaches(bright, clip):
             clear = clear & (brightest(bright) < clip)
-    return mean, residual, clear
+    return mean, residual, weakest, clear
 
 
 @inlined_kernel
