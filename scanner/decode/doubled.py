@@ -93,12 +93,16 @@ class Misplaced:
 
     @property
     def late(self) -> int:
-        """1 where a set's first frame shows nothing of it, -1 where its last one does: all of its others may be late by
-        a shift then, or early, which no residual tells; else 0."""
+        """1 where a set's first frame shows nothing of it, or what the second one shows, -1 where its last one shows
+        nothing, or what the one before shows: all of its others may be late by a shift then, or early, which no
+        residual tells; else 0."""
         if len(self.orders) != 1 or len(self.orders[0].false) != 1:
             return 0
         shows, (false,) = self.orders[0].shows, self.orders[0].false
-        return {0: 1, len(shows) - 1: -1}.get(false, 0) if shows[false] == NONE else 0
+        last = len(shows) - 1
+        if false not in (0, last) or shows[false] not in (NONE, 1 if false == 0 else last - 1):
+            return 0
+        return 1 if false == 0 else -1
 
     def says(self, position: Callable[[int, int], int]) -> str:
         """In words. position: of (set, frame) in the sequence."""

@@ -40,7 +40,7 @@ from scanner.decode.lone_set import require_fringes
 from scanner.decode.pmp_axis import AxisFound, AxisMaps, PmpThresholds, decode_axis, decoded_maps, undecided
 from scanner.decode.pmp_frames import axis_frames
 from scanner.decode.pmp_plan import plan_axis, whole_sets
-from scanner.decode.rotated import cannot_reveal, hides_late_set, out_of_step, rotated_sets
+from scanner.decode.rotated import cannot_reveal, hides_late_set, out_of_step, rotated_sets, still_apart
 from scanner.decode.strips import threads_to_use
 from scanner.errors import DecodeError
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern, ProjectorSize
@@ -194,7 +194,7 @@ class PmpDecoder:
 
     def _decoded_in_step(self, axis: Axis, brief: bool) -> AxisFound:
         """Decode one axis, without the frames of it that are found to show what they should not."""
-        found = self._decoded_axis(axis, brief)
+        found, known = self._decoded_axis(axis, brief), len(self._doubled)
         for look in (self._all_late, self._misplaced, *[self._disordered] * len(self._pattern.frequencies)):
             mended = look(axis, found) if found.may_be_doubled else None
             if mended is not None:
@@ -207,6 +207,9 @@ class PmpDecoder:
             return self._without_values(axis, found, brief, Reason.MOVED)
         if rotated := rotated_sets(found.ladder, found.remainders, shifts):
             self._doubled += out_of_step(axis, rotated, frequencies, shifts)
+            return self._without_values(axis, found, brief)
+        if len(self._doubled) > known and (more := still_apart(axis, found.remainders)):
+            self._doubled += more
             return self._without_values(axis, found, brief)
         return found
 

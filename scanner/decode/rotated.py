@@ -63,6 +63,20 @@ def rotated_sets(ladder: Ladder, steps: Sequence[Remainder], shifts: Sequence[in
     )
 
 
+def still_apart(axis: str, steps: Sequence[Remainder]) -> tuple[str, ...]:
+    """What a user should know where frames were put in step, and steps still leave the same at every pixel.
+
+    Other causes than frames out of step may leave as much (a scene that drifts, light that surfaces throw at one
+    another); beside frames that were out of step nobody can tell.
+    """
+    if not any(abs(s.offset) >= LEAST_OFFSET and _alike_everywhere(s) for s in steps):
+        return ()
+    return (
+        f"along {axis} frequencies differ by the same part of a fringe at every pixel without these frames, too: more "
+        "of them are out of step; capture again",
+    )
+
+
 def out_of_step(
     axis: str, rotated: Sequence[Rotated], frequencies: Sequence[float], shifts: Sequence[int]
 ) -> tuple[str, ...]:
