@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.decode.frame_orders import (
+    ALL_UP_TO,
     LEAST_SHARE,
     LIT2,
     MOST_SHIFTS,
@@ -27,6 +28,7 @@ from scanner.decode.frame_orders import (
     least_left,
     left_beside_overtones,
     lies_beside,
+    orders_late,
     orders_of,
     orders_without,
     owed,
@@ -137,6 +139,10 @@ class Misplaced:
         false = [position(self.of_set, n) for n in order.false]
         if order.exchanged:
             return f"frames {false[0]} and {false[1]} changed places"
+        if order.late:
+            return (
+                f"frames {false[0]}..{false[-1]} show what the one {'before' if order.late > 0 else 'after'} each does"
+            )
         shown = [self.source if m == NONE else (self.of_set, m) for m in (order.shows[n] for n in order.false)]
         named = [f"what frame {position(*of)} shows" if of else "nothing of its set" for of in shown]
         return ", ".join(f"frame {n} shows {what}" for n, what in zip(false, named, strict=True))
@@ -272,7 +278,7 @@ class _Verdict:
         orders, source = self._explaining(before) or self._several_alike(before), None
         if not orders:
             orders, source = self._foreign(before)
-        if orders:
+        if orders := orders or self._late(before):
             return [Misplaced(self._k, self._plain(orders), orders, source)]
         if noise is None or self._trembles_little():
             return []
@@ -306,6 +312,15 @@ class _Verdict:
         tried = enough[np.argsort(self._left[enough], kind="stable")][:_TRIED]
         left = {int(h): left_beside_overtones(self._samples, known.orders[h]) for h in tried}
         return self._best(before, [(known.orders[h], after) for h, after in left.items()], self._freedom)
+
+    def _late(self, before: float) -> tuple[Order, ...]:
+        """Orders with several frames in a row that are late, or early."""
+        if not 4 < self._shifts <= ALL_UP_TO:
+            return ()
+        known = orders_late(self._shifts)
+        tried = np.argsort(known.left(self._seen.products[self._k]), kind="stable")[:_TRIED]
+        left = [(known.orders[h], left_beside_overtones(self._samples, known.orders[h])) for h in tried]
+        return self._best(before, left, self._freedom)
 
     def _foreign(self, before: float) -> tuple[tuple[Order, ...], tuple[int, int] | None]:
         """Orders with one frame that shows nothing of its set, and what of another set it shows."""
@@ -361,7 +376,7 @@ class _Verdict:
     def _plain(self, orders: tuple[Order, ...]) -> bool:
         """Whether it is plain which frames are false, and enough are left."""
         one = orders[0]
-        return len(orders) == 1 and (one.exchanged or self._shifts - len(one.false) >= FEWEST_LEFT)
+        return len(orders) == 1 and not one.late and (one.exchanged or self._shifts - len(one.false) >= FEWEST_LEFT)
 
 
 def _differences(products: NDArray[np.float64]) -> NDArray[np.float64]:

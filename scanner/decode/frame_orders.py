@@ -75,6 +75,13 @@ class Order:
         """Two frames changed places; otherwise each shows another one's picture, or none of its set."""
         return len(self.false) == 2 and tuple(self.shows[n] for n in self.false) == self.false[::-1]
 
+    @property
+    def late(self) -> int:
+        """1 where several frames in a row show what the one before each shows, -1 the one after; else 0."""
+        by = {n - self.shows[n] for n in self.false}
+        in_a_row = len(self.false) > 1 and self.false[-1] - self.false[0] == len(self.false) - 1
+        return by.pop() if in_a_row and by in ({1}, {-1}) else 0
+
 
 @dataclass(frozen=True)
 class Orders:
@@ -105,9 +112,24 @@ def orders_of(shifts: int) -> Orders:
         orders.append(Order.of(shifts, {n: m}))
         if n < m:
             orders.append(Order.of(shifts, {n: m, m: n}))
-    turns = 2 * pi / shifts * np.array([order.shows for order in orders])
+    return _left_by(orders)
+
+
+@lru_cache(maxsize=16)
+def orders_late(shifts: int) -> Orders:
+    """Each with some frames in a row that show what the one before each shows, or the one after: a frame came twice and
+    another one not at all. The others are as meant. ALL_UP_TO shifts or fewer."""
+    rows = [(a, b) for a in range(shifts) for b in range(a + 2, shifts + 1)]
+    late = [Order.of(shifts, {n: n - 1 for n in range(a, b)}) for a, b in rows if a > 0]
+    early = [Order.of(shifts, {n: n + 1 for n in range(a, b)}) for a, b in rows if b < shifts]
+    return _left_by([*late, *early])
+
+
+def _left_by(orders: list[Order]) -> Orders:
+    """What orders leave all of whose frames show something of their set."""
+    turns = 2 * pi / len(orders[0].shows) * np.array([order.shows for order in orders])
     design = np.stack([np.ones_like(turns), np.cos(turns), np.sin(turns)], axis=2)
-    rests = np.eye(shifts) - design @ np.linalg.pinv(design)
+    rests = np.eye(turns.shape[1]) - design @ np.linalg.pinv(design)
     return Orders(tuple(orders), rests.reshape(len(orders), -1))
 
 

@@ -235,9 +235,11 @@ class PmpDecoder:
         """The same, of frames that their own sets tell."""
         sets = [s for s in self._pattern.sets() if s.axis == axis]
         faults = misplaced_frames(axis_frames(self._pattern, axis, self._frames), found.sample)
-        shifts, ladder = self._pattern.shifts, found.ladder
+        shifts, ladder, several = self._pattern.shifts, found.ladder, sum(one.late != 0 for one in faults) > 1
         faults = [
-            replace(one, mended=False) if one.late and hides_late_set(ladder, one.of_set, one.late, shifts) else one
+            replace(one, mended=False)
+            if one.late and (several or hides_late_set(ladder, one.of_set, one.late, shifts))
+            else one
             for one in faults
         ]
         for fault in faults:

@@ -62,6 +62,8 @@ class PmpPattern:
             raise DecodeError(
                 f"{len(self.frequencies)} frequencies and {len(self.shifts)} shifts: give one number of shifts for each"
             )
+        if not self.frequencies:
+            raise DecodeError("no frequency is given: a PMP pattern has one set of fringes or more")
         if any(not MIN_FREQUENCY <= f <= MAX_FREQUENCY for f in self.frequencies):
             raise DecodeError(
                 f"frequencies must lie in {MIN_FREQUENCY:g} .. {MAX_FREQUENCY:g}, got {list(self.frequencies)}"

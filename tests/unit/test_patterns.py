@@ -317,3 +317,8 @@ BAD = [
 def test_a_bad_description_is_named(description, says):
     with pytest.raises(DecodeError, match=re.escape(says)):
         PatternSequence.from_description(PROJECTOR, description)
+
+
+def test_a_pattern_without_fringes_is_refused():
+    with pytest.raises(DecodeError, match="no frequency is given"):
+        PmpPattern(("y",), (), ())
