@@ -127,15 +127,14 @@ class PmpDecoder:
         for axis in self._pattern.axes:
             if axis not in self._found:
                 self._decode(axis)
-        for axis, found in self._found.items():
+        for axis in self._pattern.axes:
+            found = self._found[axis]
             self._require_fringes(axis, found)
-            warnings += disagreements(axis, found.remainders) + doubtful_counts(axis, found.remainders)
             if (changes := found.light.flicker) is not None:
                 warnings += tuple(filter(None, [changes.warning(axis, found.random_px)]))
             if found.ripple is not None and (ripple := found.ripple.warning(axis, found.light)) is not None:
                 warnings += (ripple,)
-            if (end := self._ends[axis]) is not None:
-                warnings += tuple(filter(None, [end.warning(axis)]))
+            warnings += self._told_of_counts(axis, found)
         warnings += self._found[self._pattern.axes[0]].ladder.warnings()
         return self._decoded((*self._doubled, *warnings))
 
@@ -157,7 +156,7 @@ class PmpDecoder:
         shape = self._camera.shape
         position, confidence = found.maps.position.reshape(shape), found.maps.confidence.reshape(shape)
         rows, columns = (position, None) if axis == "y" else (None, position)
-        warnings = (*self._doubled, *warnings, *disagreements(axis, found.remainders))
+        warnings = (*self._doubled, *warnings, *self._told_of_counts(axis, found), *found.ladder.warnings())
         return Coordinates(rows, columns, confidence, warnings)
 
     def _took(self, fringe: int, frame: NDArray[Any]) -> None:
@@ -278,6 +277,12 @@ class PmpDecoder:
             lambda: heights_of(self._pattern, along, found.sample), found.counts,
         )  # fmt: skip
         return found
+
+    def _told_of_counts(self, axis: Axis, found: AxisFound) -> tuple[str, ...]:
+        """What a user should know of periods that may be counted wrong."""
+        end = self._ends[axis]
+        ends = () if end is None else tuple(filter(None, [end.warning(axis)]))
+        return disagreements(axis, found.remainders) + doubtful_counts(axis, found.remainders) + ends
 
     def _require_fringes(self, axis: Axis, found: AxisFound) -> None:
         if len(self._pattern.frequencies) == 1:

@@ -486,7 +486,18 @@ def test_coordinates_alone_are_those_of_all_maps(axes, frequencies):
         a, b = getattr(found, name), getattr(expected, name)
         assert (a is None and b is None) or np.array_equal(a, b, equal_nan=True)
     assert set(found.warnings) <= set(expected.warnings)
+    left_out = set(expected.warnings) - set(found.warnings)
+    assert all(words.startswith(("ripple", "flicker")) for words in left_out)
     assert any("missing: 2" in warning for warning in found.warnings)
+
+
+def test_a_pattern_of_wide_steps_is_warned_of_with_coordinates_alone():
+    camera = CameraFormat(203, 97)
+    pattern = PmpPattern(("y",), (1.0, 40.0), (8, 8))
+    decoder = PmpDecoder(PatternSequence(PROJECTOR, pattern), camera)
+    for position, frame in enumerate(render(pattern, camera)):
+        decoder.keep(position, frame)
+    assert any("unwrapped by" in warning for warning in decoder.coordinates().warnings)
 
 
 def test_strips_cover_every_pixel_once():
