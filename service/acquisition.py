@@ -127,17 +127,18 @@ class Scan:
 
     def _ended_with(self, outcome: Acquisition) -> Callable[[StorageError | None], None]:
         def say(problem: StorageError | None) -> None:
-            error = problem or self._with_timing(outcome.error)
+            error = problem or self._with_timing(outcome)
             reason: EndReason = outcome.reason.value if problem is None else reason_of(problem) or "disk_full"
             body = None if error is None else error_body(error)
             self._say(Ended(self.job, reason, self._lines, list(outcome.missing), body, outcome.report()))
 
         return say
 
-    def _with_timing(self, error: ScannerError | None) -> ScannerError | None:
-        """A scan that is out of step by a latency that is not the projector's says so."""
-        if isinstance(error, SyncError) and (said := self._opened.disagreement) is not None:
-            error.hint = said
+    def _with_timing(self, outcome: Acquisition) -> ScannerError | None:
+        """A run's error; of one that is out of step with what to do about latency and settling as this rig has them."""
+        error = outcome.error
+        if isinstance(error, SyncError) and outcome.reason is FinishReason.SYNC_LOST:
+            error.hint = self._opened.timing_hint
         return error
 
     def _ended_by(self, error: ScannerError) -> Callable[[StorageError | None], None]:

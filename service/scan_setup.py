@@ -122,6 +122,25 @@ class OpenRig:
             self.disagreement = _disagreement(latency, found)
             _log.warning("%s: %s", rig.projector.name, self.disagreement)
 
+    @property
+    def timing_hint(self) -> str:
+        """What to do where a scan is out of step: what it believed of latency and settling, and where that is from."""
+        if self.disagreement is not None:
+            return self.disagreement
+        typed = [name for name in ("latency_us", "settle_us") if self.settings["projector"][name] is not None]
+        if typed:
+            names, them = " and ".join(typed), "they are" if len(typed) > 1 else "it is"
+            return f"take {names} out of the rig file so that {them} measured, or raise dwell"
+        if self.latency_checked:
+            return (
+                "light comes at other times than were measured before the scan: turn off what buffers pictures "
+                "(a compositor, a television's picture mode), or raise dwell"
+            )
+        return (
+            "the projector's latency and settling are those that its driver states: hold them against fringed "
+            "calibrate sync, or raise dwell"
+        )
+
     def exposure_for(
         self, clock: Clock, sequence: PatternSequence, given: float | str | None = None
     ) -> tuple[int, dict[str, Any]]:

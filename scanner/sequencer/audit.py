@@ -8,7 +8,7 @@ from typing import Any
 
 from scanner.capture import Capture
 from scanner.errors import DecodeError
-from scanner.sequencer.disorder import RECORDED_HINT, sync_error
+from scanner.sequencer.disorder import RECORDED_HINT, concerned, sync_error
 from scanner.sequencer.findings import Witnesses
 from scanner.sequencer.hearing import Hearing
 from scanner.sequencer.plan import Plan
@@ -35,9 +35,21 @@ class CaptureCheck:
         return tuple(sorted(stamped | set(self.witnesses.suspects)))
 
     @property
+    def concerned(self) -> str:
+        """The same in words, with the order of all frames where that is in doubt; empty where none is named."""
+        if not self.suspects and not self.witnesses.whole:
+            return ""
+        return concerned(self.capture.header.sequence, self.suspects, self.witnesses)
+
+    @property
     def passed(self) -> bool:
         """Whether nothing speaks against the frames that are here."""
         return not self.suspects and self.witnesses.passed
+
+    def against(self, position: int) -> tuple[str, ...]:
+        """Names of the witnesses that speak against the picture of the frame at a position."""
+        names = [item.name for item in self.witnesses.items if not item.passed and position in item.frames]
+        return tuple(dict.fromkeys(names))
 
     def summary(self) -> Mapping[str, int]:
         """Number of frames by verdict."""
@@ -65,11 +77,18 @@ class CaptureCheck:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for report.json."""
+        count = len(self.capture.header.sequence)
         return {
             "passed": self.passed,
             "verdicts": dict(self.summary()),
             "frames": [
-                {"pattern": v.pattern, "verdict": v.verdict, "suspect": v.suspect, "reasons": list(v.reasons)}
+                {
+                    "pattern": v.pattern,
+                    "verdict": v.verdict,
+                    "suspect": v.suspect,
+                    "reasons": list(v.reasons),
+                    "against": list(self.against(v.pattern % count)),
+                }
                 for v in self.verdicts
             ],
             "witnesses": self.witnesses.as_list(),

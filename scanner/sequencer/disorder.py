@@ -9,10 +9,7 @@ from scanner.patterns import FrameRole, PatternSequence
 from scanner.sequencer.findings import Witnesses, listed
 from scanner.sequencer.verify import FrameVerdict
 
-LIVE_HINT = (
-    "take latency_us and settle_us out of the rig file so that they are measured, or raise dwell; fringed audit draws "
-    "the timing"
-)
+LIVE_HINT = "light comes at other times than its flips say, or pictures in another order: raise dwell"
 RECORDED_HINT = (
     "the frames' order or timing is not what capture.json says; capture again, or look at it with fringed audit"
 )
@@ -45,16 +42,23 @@ def sync_error(
     if witnesses.dark:
         why, remedy = witnesses.why_dark
         return DecodeError(why, hint=remedy)
-    frames = sorted(set(suspects) | set(witnesses.suspects))
-    if witnesses.whole:
-        frames = list(range(len(sequence)))
+    named = sorted(set(suspects) | set(witnesses.suspects))
+    frames = list(range(len(sequence))) if witnesses.whole else named
     says = [found.says for found in witnesses.items if not found.passed and found.says]
     reasons = [reason for verdict in verdicts if verdict.suspect for reason in verdict.reasons[:1]]
     detail = "; ".join(dict.fromkeys([*said, *says, *reasons])) or "stamps and content contradict the plan"
-    named = f"frame{'s' if len(frames) != 1 else ''} {listed(frames)}"
     tried = f" after {retakes} retakes" if retakes else ""
     return SyncError(
-        f"{named} out of step with the projector{tried}: {detail}",
+        f"{concerned(sequence, named, witnesses)} out of step with the projector{tried}: {detail}",
         frames=frames,
         hint=hint,
     )
+
+
+def concerned(sequence: PatternSequence, suspects: Sequence[int], witnesses: Witnesses) -> str:
+    """The frames that something speaks against, in words; with the order of all of them where that is in doubt."""
+    count = len(sequence)
+    if witnesses.whole and len(suspects) in (0, count):
+        return f"frames {listed(range(count))}"
+    named = f"frame{'s' if len(suspects) != 1 else ''} {listed(suspects)}"
+    return f"{named} and the order of all {count}" if witnesses.whole else named

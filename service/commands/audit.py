@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from scanner.sequencer import CaptureCheck
     from scanner.sequencer.findings import Witness
 
-NOTHING_HIDDEN = "nothing of what its witnesses look for: frames swapped, doubled, late or left out"
+BLIND, SEES = "this sequence cannot reveal", "this sequence can reveal"
+ALL = "all that its witnesses look for: frames swapped, doubled, late or left out"
 
 
 def audit(
@@ -50,7 +51,6 @@ def audit(
         lines.stage("reading frames")
         from scanner.capture import Capture  # noqa: PLC0415
         from scanner.sequencer import check_capture, timing_diagram  # noqa: PLC0415
-        from scanner.sequencer.findings import listed  # noqa: PLC0415
         from scanner.storage import replace_file  # noqa: PLC0415
 
         check = check_capture(Capture.open(capture))
@@ -62,8 +62,7 @@ def audit(
     else:
         _show(check, output)
     if not check.passed:
-        suspects = listed(check.suspects) or "none in particular"
-        print_error(f"frames and patterns are out of step; frames concerned: {suspects}")
+        print_error(f"frames and patterns are out of step; concerned: {check.concerned or 'no frame in particular'}")
     return 0 if check.passed else 1
 
 
@@ -72,8 +71,17 @@ def _show(check: CaptureCheck, diagram: Path | None) -> None:
     count = len(sequence)
     print_table(
         "frames",
-        ("pattern", "shows", "verdict", "reasons"),
-        ((v.pattern, sequence.role(v.pattern % count).value, v.verdict, "; ".join(v.reasons)) for v in check.verdicts),
+        ("pattern", "shows", "by time stamps", "by pictures", "reasons"),
+        (
+            (
+                v.pattern,
+                sequence.role(p := v.pattern % count).value,
+                v.verdict,
+                _picture(check, p),
+                "; ".join(v.reasons),
+            )
+            for v in check.verdicts
+        ),
     )
     print()
     if witnesses := check.witnesses.items:
@@ -81,11 +89,24 @@ def _show(check: CaptureCheck, diagram: Path | None) -> None:
         print()
     facts = [("capture", str(check.capture.path))]
     facts += [("frames", f"{len(check.capture.records)} of {check.capture.header.frame_count}")]
-    facts += [(str(verdict), str(number)) for verdict, number in check.summary().items()]
-    facts += [("this sequence cannot reveal", text) for text in check.witnesses.cannot_reveal or (NOTHING_HIDDEN,)]
+    facts += [("by time stamps", ", ".join(f"{number} {verdict}" for verdict, number in check.summary().items()))]
+    if check.witnesses.items:
+        against = check.witnesses.suspects
+        facts += [("by pictures", f"{len(against)} of {count} contradicted" if against else "none contradicted")]
+    facts += [(BLIND, text) for text in check.witnesses.cannot_reveal] or [(SEES, ALL)]
     if diagram is not None:
         facts.append(("diagram", str(diagram)))
     print_facts("audit", facts)
+
+
+def _picture(check: CaptureCheck, position: int) -> str:
+    """What the pictures say of one frame, in a word or two."""
+    witnesses = check.witnesses
+    if against := check.against(position):
+        return f"against: {', '.join(against)}"
+    if not witnesses.items:
+        return "not asked"
+    return "order in doubt" if witnesses.whole else "nothing against"
 
 
 def _verdict(witness: Witness) -> str:

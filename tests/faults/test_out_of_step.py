@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from scanner.errors import DecodeError, DeviceLost, SyncError
 from scanner.patterns import PatternSequence, PmpPattern
 from scanner.reconstruct import reconstruct
 from scanner.sequencer import FinishReason, check_capture
+from service import cli
 from tests.unit.sequencer_bench import Taken, gray, pmp, take
 
 EIGHT = pmp((1.0, 8.0), (8, 8))
@@ -301,8 +303,27 @@ def test_a_whole_sequence_in_doubt_is_named_shortly() -> None:
     error = take(EIGHT, "order=reverse").acquisition.error
     assert isinstance(error, SyncError)
     assert error.frames == tuple(range(len(EIGHT)))
-    assert f"frames 0..{len(EIGHT) - 1} out of step" in error.message
-    assert "latency_us" in (error.hint or "")
+    assert f" and the order of all {len(EIGHT)} out of step" in error.message
+    assert "raise dwell" in (error.hint or "")
+
+
+def test_the_scan_and_the_audit_name_the_same_frames_and_none_of_them_is_called_proved_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken = take(EIGHT, "late_flips=5")
+    folder = written(tmp_path / "capture", taken).path
+    assert cli.main(["audit", str(folder)]) == 1
+    out, err = capsys.readouterr()
+    check = check_capture(Capture.open(folder))
+    assert check.suspects
+    assert f"concerned: {check.concerned}\n" in err
+    assert str(taken.acquisition.error).startswith(f"{check.concerned} out of step")
+    lines = out.splitlines()[1:]
+    for position, frame in enumerate(check.as_dict()["frames"]):
+        said = "against: " + ", ".join(frame["against"]) if frame["against"] else "order in doubt"
+        assert (frame["verdict"], bool(frame["against"])) == ("proved", position in check.suspects)
+        assert lines[position].split(maxsplit=3)[2:] == ["proved", said]
+    assert re.search(rf"^by pictures +{len(check.suspects)} of {len(EIGHT)} contradicted$", out, re.MULTILINE)
 
 
 def test_a_folder_out_of_step_is_not_told_to_measure_latencies(tmp_path: Path) -> None:
@@ -310,7 +331,7 @@ def test_a_folder_out_of_step_is_not_told_to_measure_latencies(tmp_path: Path) -
         check_capture(written(tmp_path / "capture", take(EIGHT), {5: 6, 6: 5})).raise_if_out_of_step()
     assert error.value.frames == (5, 6)
     assert "capture.json" in (error.value.hint or "")
-    assert "latency_us" not in (error.value.hint or "")
+    assert "dwell" not in (error.value.hint or "")
 
 
 def test_a_folder_with_a_plan_and_no_stamps_is_judged_by_its_content(tmp_path: Path) -> None:

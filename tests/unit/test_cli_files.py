@@ -1,6 +1,7 @@
 """`fringed patterns`, `decode` and `audit`: what they write, and what bad input gets."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from itertools import pairwise
@@ -211,6 +212,7 @@ def test_audit_of_a_capture_without_stamps_proves_nothing(run: Run, capture: Pat
     assert status == 0
     lines = out.splitlines()
     assert any(line.startswith("this sequence cannot reveal  ") for line in lines)
+    assert any(re.fullmatch("by pictures +none contradicted", line) for line in lines)
     witnesses = json.loads(run("audit", capture, "--json")[1])["witnesses"]
     assert witnesses
     assert all(any(line.startswith(w["name"]) and "  agrees  " in line for line in lines) for w in witnesses)

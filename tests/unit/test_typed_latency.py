@@ -90,3 +90,26 @@ def test_light_later_than_any_displays_is_named_where_a_scan_fails_by_it() -> No
     assert opened.disagreement is not None
     assert opened.disagreement.startswith("the rig file's latency_us is 4.0 ms; ")
     assert "light comes later than 83 ms after a flip: turn off the projector's frame" in opened.disagreement
+
+
+@pytest.mark.parametrize(
+    ("projector", "hint"),
+    [
+        ({"latency_us": [3800, 4600]}, "take latency_us out of the rig file so that it is measured, or raise dwell"),
+        (
+            {"latency_us": [3800, 4600], "settle_us": [0, 1500]},
+            "take latency_us and settle_us out of the rig file so that they are measured, or raise dwell",
+        ),
+        ({}, "the projector's latency and settling are those that its driver states: hold them against fringed "),
+    ],
+)
+def test_a_scan_out_of_step_is_told_what_to_do_about_the_times_that_this_rig_has(
+    tmp_path: Path, projector: dict[str, Any], hint: str
+) -> None:
+    clock = VirtualClock()
+    opened = rig(clock, **projector, options={"faults": {"late_flips": 5}})
+    ended, _ = scanned(tmp_path / "scan", opened, clock)
+    opened.close()
+    assert ended.reason == "sync_lost"
+    assert ended.error is not None
+    assert str(ended.error.data["hint"]).startswith(hint)
