@@ -34,7 +34,7 @@ from scanner.ripple_correction import widen_by_ripple, without_ripple
 from scanner.saturation import overexposed
 from scanner.scale_check import require_codes_within, require_geometry
 from scanner.scan import Map, Scan, build_scan
-from scanner.scan_report import report_of_capture
+from scanner.scan_report import report_of_capture, report_of_check
 from scanner.sequencer import CaptureCheck, Hearing, check_capture
 from scanner.uncertainty import budget_of
 
@@ -188,7 +188,7 @@ class Reconstruction:
         scan, check = self._made
         phase_axis = "y" if self._calibration is None else self._calibration.phase_axis
         scan = scan.with_report(
-            sync=check.as_dict(),
+            **report_of_check(check, scan.report["decoder"]),
             capture=report_of_capture(capture),
             uncertainty=self._budget(scan, check.mixed_share),
         )

@@ -26,6 +26,7 @@ from scanner.geometry import Calibration
 
 if TYPE_CHECKING:
     from scanner.scan import Scan
+    from scanner.sequencer import CaptureCheck
 
 Map = NDArray[np.float32]
 
@@ -94,6 +95,29 @@ def report_of_capture(capture: Capture) -> dict[str, Any]:
         "reason": header.reason,
         "repeat": header.repeat,
         "exposure": exposure_report(header),
+    }
+
+
+def report_of_check(check: CaptureCheck, decoder: Mapping[str, Any]) -> dict[str, Any]:
+    """The report's `sync`, what the scan as a whole `cannot_reveal`, and its `decoder` without a list of its own.
+
+    The decoder knows its fringes alone: what those hide the order bars show, where the scene shows the bars. Fringes
+    whose phase a code must agree with cannot turn unseen.
+
+    Args:
+        decoder: the decoder's details.
+    """
+    sync, sequence = check.as_dict(), check.capture.header.sequence
+    blind: list[str] = sync.pop("cannot_reveal")
+    if "phase_and_code" in decoder:
+        blind = [text for text in blind if not text.startswith("rotations of sets")]
+    agreed = {found.name for found in check.witnesses.items if found.passed}
+    if not all(f"order bars {axis}" in agreed for axis in getattr(sequence.pattern, "axes", ())):
+        blind += decoder.get("cannot_reveal", ())
+    return {
+        "sync": sync,
+        "decoder": {name: value for name, value in decoder.items() if name != "cannot_reveal"},
+        "cannot_reveal": blind,
     }
 
 

@@ -69,6 +69,7 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         facts.append(("depth", f"{near:.1f} .. {far:.1f} mm (1st to 99th percentile)"))
     if (stated := _uncertainty(report.get("uncertainty") or {})) is not None:
         facts.append(stated)
+    facts += _blind(report)
     if removed := {name: count for name, count in (report.get("removed") or {}).items() if count}:
         facts.append(("filtered", ", ".join(f"{count:,} {name}" for name, count in removed.items())))
     truth = report.get("truth") or {}
@@ -83,6 +84,13 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         more = f"; {everywhere:,} with those at edges" if everywhere not in (None, wrong) else ""
         facts.append(("wrong", f"{wrong:,} points off by half a fringe or stripe, or by 20 mm{more}"))
     return facts
+
+
+def _blind(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Faults of order that would not have shown; of a single frame, which has no order, none."""
+    frames = sum(((report.get("capture") or {}).get("shows") or {}).values())
+    found = report.get("cannot_reveal") or ()
+    return [("cannot reveal", "; ".join(found))] if found and frames > 1 else []
 
 
 def _everywhere(truth: Mapping[str, Any]) -> list[tuple[str, str]]:

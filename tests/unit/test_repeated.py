@@ -146,13 +146,13 @@ PROJECTOR = ProjectorSize(96, 80)
 SEQUENCE = PatternSequence.bracketed(PROJECTOR, PmpPattern(frequencies=(1.0, 8.0), shifts=(4, 4)))
 
 
-def captured(folder, patterns):
+def captured(folder, patterns, sequence=SEQUENCE):
     """A folder with these of the frames of three repetitions, seen by a camera that looks through the projector."""
-    header = CaptureHeader(SEQUENCE, CameraFormat(PROJECTOR.width, PROJECTOR.height, 8), id="test", repeat=3)
+    header = CaptureHeader(sequence, CameraFormat(PROJECTOR.width, PROJECTOR.height, 8), id="test", repeat=3)
     writer = CaptureWriter(folder, header, header.frame_count)
     random = np.random.default_rng(7)
     for pattern in patterns:
-        image = 20 + 0.8 * SEQUENCE.image(pattern % len(SEQUENCE)) + random.normal(0, 1, (80, 96))
+        image = 20 + 0.8 * sequence.image(pattern % len(sequence)) + random.normal(0, 1, (80, 96))
         slot, digest = writer.write(np.rint(image).clip(0, 255).astype(np.uint8))
         writer.record(FrameRecord(slot, pattern, xxh3=digest))
     writer.close("complete")
@@ -168,6 +168,18 @@ def test_a_captures_repetitions_are_averaged(tmp_path):
     once = reconstruct(captured(tmp_path / "once", range(len(SEQUENCE))), None).rows - np.arange(80)[:, None]
     assert np.nanstd(error) < 0.9 * np.nanstd(once)
     assert scan.report["warnings"] == []
+
+
+def test_one_list_says_what_a_scan_as_a_whole_cannot_reveal(tmp_path):
+    bare = PatternSequence(PROJECTOR, SEQUENCE.pattern, sentinels=(0, 1, 2, 11, 12, 13))
+    hidden = "frequency 1 shown 1, 2, 3 of its 4 shifts late or early as a whole"
+    for name, sequence, blind in (("bars", SEQUENCE, []), ("none", bare, [hidden])):
+        scan = reconstruct(captured(tmp_path / name, range(3 * len(sequence)), sequence), None)
+        assert "cannot_reveal" not in scan.report["decoder"]
+        assert "cannot_reveal" not in scan.report["sync"]
+        found = scan.report["cannot_reveal"]
+        assert [text for text in found if "order bars" not in text] == blind
+        assert ("sets along y that are all rotated or reversed alike (no order bars)" in found) == (name == "none")
 
 
 def test_a_repetition_that_cannot_be_decoded_is_left_out_and_named(tmp_path):
