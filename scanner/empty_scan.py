@@ -6,6 +6,7 @@ import numpy as np
 
 from scanner.decode import Decoded, Reason
 from scanner.errors import DecodeError
+from scanner.saturation import OVEREXPOSED
 
 _IN_WORDS = {
     Reason.SHADOW: "in shadow",
@@ -42,7 +43,9 @@ def raise_if_empty(decoded: Decoded) -> None:
     first = order[0]
     named = ", ".join(f"{counts[r]:,} {_IN_WORDS[r]}" for r in sorted(_IN_WORDS, key=lambda r: -counts[r]) if counts[r])
     remedy = _REMEDIES.get(first, "look at the order of the frames with fringed audit, and capture again")
+    if any(said.startswith(OVEREXPOSED) for said in decoded.warnings):
+        remedy = ""  # it says what to do, and how much
     raise DecodeError(
         f"no pixel could be decoded although the scene is lit: of {int(counts.sum()):,} pixels {named}",
-        hint="; ".join([*decoded.warnings, remedy]),
+        hint="; ".join(filter(None, [*decoded.warnings, remedy])),
     )

@@ -8,12 +8,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scanner.capture import Capture
 from scanner.capture.exposure import exposure_report
 from scanner.decode import Decoded, Reason
 from scanner.decode.reasons import tally
 from scanner.patterns import PmpPattern
+
+OVEREXPOSED = "overexposed: "
+"""How the warning begins"""
 
 LARGE = 0.01
 """Share of what shows the pattern: automatic exposure lets fewer than one pixel in 200 saturate (glints)."""
@@ -24,13 +28,17 @@ CLIP = 0.98
 AIM = 0.9
 """Share of that level for what is advised, .88 of the range: between automatic exposure's choices, .95 and less."""
 
-MOST = 10.0
-"""Fringes that are so many times too bright are saturated in eight of ten samples: more cannot be told by counting."""
+SURE, MOST = 2.0, 10.0
+"""Fringes that are twice too bright are saturated in half of their samples, and what is advised is right to a tenth.
+Beyond, blur (which leaves fine fringes no black) makes it a guess on the short side: 19 ms of 200 where 31 would do.
+Ten times too bright are eight of ten: more cannot be told by counting."""
 
 PERCENTILE = 99.5
 """Of the pixels' brightness, as automatic exposure has it."""
 
-_EVERY = 8
+_EVERY, _BLOCK = 8, 4
+"""Pixels from sample to sample, and samples each way that are counted together. Of one pixel's eight shifts a whole
+number is saturated; its neighbours' phases differ, and the mean is the share that the brightness makes."""
 
 
 def overexposed(decoded: Decoded, capture: Capture) -> tuple[str, ...]:
@@ -50,7 +58,7 @@ def overexposed(decoded: Decoded, capture: Capture) -> tuple[str, ...]:
     automatic = "" if mode == "auto" else ", or automatically (--exposure auto)"
     advice = "expose for less" if used is None else _advice(used / 1000, _too_bright(capture))
     return (
-        f"overexposed: {clipped / shows:.1%} of the pixels in which the pattern shows are saturated and have no value: "
+        f"{OVEREXPOSED}{clipped / shows:.1%} of the pixels in which the pattern shows are saturated and have no value: "
         f"{advice}{automatic}, lower the gain, or close the lens",
     )
 
@@ -58,7 +66,11 @@ def overexposed(decoded: Decoded, capture: Capture) -> tuple[str, ...]:
 def _advice(used_ms: float, factor: float | None) -> str:
     if factor is None:
         return f"expose for half of these {used_ms:.3g} ms at most"
-    return f"expose for {used_ms * AIM / factor:.2g} ms at most (these were {used_ms:.3g})"
+    less, share = used_ms * AIM / factor, math.acos(2 / factor - 1) / math.pi
+    if factor <= SURE:
+        return f"expose for {less:.2g} ms at most (these were {used_ms:.3g})"
+    guessed = f"{less:.2g} ms or less" if factor >= MOST else f"some {less:.2g} ms"
+    return f"expose for {guessed} (a guess: after {used_ms:.3g} ms {share:.0%} of the brightest fringes is gone)"
 
 
 def _too_bright(capture: Capture) -> float | None:
@@ -73,5 +85,13 @@ def _too_bright(capture: Capture) -> float | None:
         return None
     level = CLIP * header.camera.max_value
     over = np.mean([capture.frame(p)[::_EVERY, ::_EVERY] >= level for p in present], axis=0)
-    share = float(np.percentile(over, PERCENTILE))
+    share = float(np.percentile(_in_blocks(over), PERCENTILE))
     return min(MOST, 2.0 / max(1e-9, 1.0 + math.cos(math.pi * share)))
+
+
+def _in_blocks(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Means of blocks of `_BLOCK` samples each way, (H // _BLOCK, W // _BLOCK); of less where an image has fewer."""
+    high, wide = (min(_BLOCK, count) for count in values.shape)
+    rows, columns = values.shape[0] // high, values.shape[1] // wide
+    whole = values[: rows * high, : columns * wide].reshape(rows, high, columns, wide)
+    return np.asarray(whole.mean(axis=(1, 3)))

@@ -67,7 +67,7 @@ def _quality(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     spread = report.get("depth_mm") or {}
     if (near := spread.get("p1")) is not None and (far := spread.get("p99")) is not None:
         facts.append(("depth", f"{near:.1f} .. {far:.1f} mm (1st to 99th percentile)"))
-    if (stated := _uncertainty(report.get("uncertainty") or {})) is not None:
+    if (stated := _uncertainty(report.get("uncertainty") or {}, _few(report.get("coverage") or {}))) is not None:
         facts.append(stated)
     facts += _blind(report)
     if removed := {name: count for name, count in (report.get("removed") or {}).items() if count}:
@@ -144,7 +144,15 @@ def _frames(capture: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [("frames", f"{fringes} of the pattern, {', '.join(others)}{repeated}{missing}")]
 
 
-def _uncertainty(budget: Mapping[str, Any]) -> tuple[str, str] | None:
+def _few(coverage: Mapping[str, Any]) -> str:
+    """What share of the lit pixels the points are, where it is less than half of them: a figure is of these alone."""
+    kept = coverage.get("points_of_lit")
+    return (
+        "" if kept is None or kept >= 0.5 else f" that there are, {kept:.1%} of the pixels in which the pattern shows"
+    )
+
+
+def _uncertainty(budget: Mapping[str, Any], few: str) -> tuple[str, str] | None:
     """One line of the budget: what a point's depth is good to, and what is not in that."""
     if not budget or budget.get("within_mm") is None:
         return None
@@ -154,11 +162,11 @@ def _uncertainty(budget: Mapping[str, Any]) -> tuple[str, str] | None:
     within, random = alone(budget["within_mm"]), alone(2 * budget["random_mm"])
     if "method" in names:  # what is known is the least of it: no figure of the whole
         text = (
-            f"at least +-{within} mm {at}, of 95 in 100 points; +-{random} mm is the random part alone (k = 2, the "
-            "median point); the method's own error is not known and larger: see docs/explanation/uncertainty.md"
+            f"at least +-{within} mm {at}, of 95 in 100 points{few}; +-{random} mm is the random part alone (k = 2, "
+            "the median point); the method's own error is not known and larger: see docs/explanation/uncertainty.md"
         )
     else:
-        text = f"+-{within} mm {at}, of 95 in 100 points: the one to quote; {_of_median(budget)}"
+        text = f"+-{within} mm {at}, of 95 in 100 points{few}: the one to quote; {_of_median(budget)}"
     return "uncertainty", f"{text}{f'; unknown, and not in it: {unknown}' if unknown else ''}"
 
 

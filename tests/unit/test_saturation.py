@@ -11,6 +11,8 @@ import pytest
 
 from scanner.capture import Capture
 from scanner.decode import Reason
+from scanner.empty_scan import raise_if_empty
+from scanner.errors import DecodeError
 from scanner.patterns import GrayPattern, Pattern, PatternSequence, PmpPattern, ProjectorSize
 from scanner.saturation import overexposed
 
@@ -42,14 +44,26 @@ def decoded(clipped: float) -> Any:
     return SimpleNamespace(reason=found.reshape(25, 40))
 
 
-@pytest.mark.parametrize("brightness", [1.1, 1.5, 3.0, 6.0])
+@pytest.mark.parametrize("brightness", [1.1, 1.3, 1.5, 1.9])
 def test_the_exposure_that_is_advised_saturates_nothing_and_is_no_dim_one(brightness: float) -> None:
     (warning,) = overexposed(decoded(0.5), capture(brightness))
     assert "overexposed: 50.0% of the pixels in which the pattern shows" in warning
     assert "--exposure auto" in warning
     advised = re.search(r"expose for ([0-9.]+) ms at most \(these were 40\)", warning)
     assert advised is not None
-    assert 0.6 < float(advised[1]) / 40 * brightness < 1.0
+    assert 0.8 < float(advised[1]) / 40 * brightness < 1.0
+
+
+@pytest.mark.parametrize(("brightness", "words"), [(3.0, "some"), (6.0, "some"), (20.0, "3.6 ms or less")])
+def test_what_is_advised_where_hardly_a_sample_is_whole_is_called_a_guess(brightness: float, words: str) -> None:
+    (warning,) = overexposed(decoded(1.0), capture(brightness))
+    assert "at most" not in warning
+    advised = re.search(
+        r"expose for (some )?([0-9.]+) ms (or less )?\(a guess: after 40 ms \d+% of the brightest .*\)", warning
+    )
+    assert advised is not None
+    assert words in advised[0]
+    assert words != "some" or 0.6 < float(advised[2]) / 40 * brightness < 1.0
 
 
 @pytest.mark.parametrize("clipped", [0.0, 0.009])
@@ -66,3 +80,12 @@ def test_what_was_exposed_automatically_is_not_told_to_be() -> None:
     (warning,) = overexposed(decoded(0.2), capture(1.1, exposure={"mode": "auto"}))
     assert "ms at most" in warning
     assert "auto" not in warning
+
+
+def test_a_scan_without_a_value_says_once_what_to_do_about_light() -> None:
+    said = overexposed(decoded(1.0), capture(3.0))
+    clipped = np.full((4, 5), Reason.CLIPPED)
+    for warnings, hint in ((said, said[0]), ((), "lower the exposure or the gain, or close the lens")):
+        with pytest.raises(DecodeError, match="20 clipped") as error:
+            raise_if_empty(SimpleNamespace(reason=clipped, warnings=warnings))  # type: ignore[arg-type]
+        assert error.value.hint == hint

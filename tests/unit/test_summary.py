@@ -62,7 +62,7 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "(7 px and more from edges)" in printed
     assert "0.683 mm rms, 0.400 mm in 99 of 100 points (all that is lit, edges too, 0.12% of them wrong; " in printed
     assert "wrong; not the 1,234 that the truth has no light for)" in printed
-    assert "+-0.16 mm at 700 mm, of 95 in 100 points" in printed
+    assert "+-0.16 mm at 700 mm, of 95 in 100 points that there are, 20.0% of the pixels in which the" in printed
     assert "the median one +-0.14 mm: +-0.14 mm random, +-0.034 mm systematic, mostly noise (k = 2)" in printed
     assert "unknown, and not in it: calibration" in printed
     assert "0 points off by half a fringe or stripe, or by 20 mm; 12 with those at edges" in printed
