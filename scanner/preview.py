@@ -40,6 +40,9 @@ _MARGIN, _GAP, _TITLE = 28, 18, 84
 _SIDE = 600
 """width of the column of maps"""
 
+STATED = "mm for 95 % of points"
+"""Caption of the stated uncertainty"""
+
 
 def preview_picture(scan: Scan) -> Picture:
     """(1200, 1920, 3) uint8 BGR."""
@@ -82,6 +85,8 @@ def _title(picture: Picture, scan: Scan) -> None:
     cv2.line(picture, (x, 28), (x, 60), LINE, 1)
     x += 28
     for words, caption in figures(scan):
+        if caption == STATED:
+            text(picture, left_out(scan), (x, 72), size=14, colour=DIM)
         end = text(picture, words, (x, 48), size=24, weight=500)
         x += end + 9
         x += text(picture, caption, (x, 48), size=17, colour=DIM) + 32
@@ -100,13 +105,19 @@ def figures(scan: Scan) -> list[tuple[str, str]]:
     return [*told, *_uncertainty(scan)]
 
 
+def left_out(scan: Scan) -> str:
+    """What the stated uncertainty has no part of, as the terminal says it; empty where it has all."""
+    unknown = (scan.report.get("uncertainty") or {}).get("unknown") or ()
+    return f"unknown, and not in it: {', '.join(unknown)}" if unknown else ""
+
+
 def _uncertainty(scan: Scan) -> list[tuple[str, str]]:
     """What the terminal says, where the scan has a budget; and the random part of it, k = 2 too."""
     told = []
     budget = scan.report.get("uncertainty") or {}
     if (within := budget.get("within_mm")) is not None:
         least = "at least " if "method" in budget.get("unknown", ()) else ""
-        told.append((f"{least}± {alone(within)}", "mm for 95 % of points"))
+        told.append((f"{least}± {alone(within)}", STATED))
     if scan.sigma_z is not None and (sigma := _sample(scan.sigma_z)).size:
         told.append((f"± {alone(2 * float(np.median(sigma)))}", "mm random (k = 2)"))
     return told

@@ -9,7 +9,7 @@ import pytest
 
 from scanner.colours import PANEL, Scale, fit, grouped, scale_of, text, text_width, ticks
 from scanner.filter_settings import FilterSettings
-from scanner.preview import figures, preview_picture
+from scanner.preview import figures, left_out, preview_picture
 from scanner.render import View, render
 from scanner.scan import build_scan
 
@@ -43,6 +43,9 @@ def test_the_title_says_what_its_figures_are(scan):
     assert float(told["mm random (k = 2)"].removeprefix("± ")) == pytest.approx(
         2 * np.nanmedian(scan.sigma_z), rel=0.05
     )
+    assert left_out(with_budget) == "unknown, and not in it: calibration"
+    below = np.s_[58:80, 140:]
+    assert preview_picture(with_budget)[below].std() > 2 * preview_picture(scan)[below].std()
     of_mcp = scan.with_report(uncertainty={"within_mm": 0.1514, "unknown": ["method"]})
     assert ("at least ± 0.15", "mm for 95 % of points") in figures(of_mcp)
 
