@@ -6,6 +6,7 @@ picture or poses that say nothing are named instead of being fitted.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from scanner.calibration.adjustment import Adjusted
 from scanner.calibration.lens_slopes import rotation_of
 from scanner.calibration.problem import Problem, State, View
 from scanner.calibration.targets import Target
+from scanner.digits import rounded
 from scanner.errors import CalibrationError
 from scanner.geometry import Lens
 
@@ -182,11 +184,17 @@ def check_stated(problem: Problem, state: State, baseline_mm: float | None, dist
             raise CalibrationError(
                 f"the {what} comes out as {found:.0f} mm, {stated:.0f} mm were entered: "
                 "the target's size is probably stated wrong",
-                hint=f"squares (spacing) of {spacing / ratio:.2f} mm instead of {spacing:g} mm would fit: measure them",
+                hint=f"squares (spacing) of about {_two_digits(spacing / ratio)} mm instead of {spacing:g} mm would "
+                "fit, as well as a rule is laid: measure them",
             )
         if abs(ratio - 1) > WARN_STATED_OFF:
             warnings.append(f"the {what} comes out as {found:.1f} mm, {stated:.1f} mm were entered ({ratio - 1:+.1%})")
     return warnings
+
+
+def _two_digits(mm: float) -> str:
+    """As a length that rests on a rule is known."""
+    return rounded(mm, 1 - math.floor(math.log10(mm)))
 
 
 def depth_and_tilt(problem: Problem, state: State) -> tuple[Array, Array]:

@@ -65,10 +65,10 @@ class Contradiction:
         if not self.target.flat:
             return "Measure again, from the first to the last point of the target's file, or correct the file"
         spacing = self.target.spacing_mm
-        fits = spacing * self.stated_mm / self.nominal_mm
+        fits = _fitting(spacing, self.stated_mm, self.stated_sigma_mm, self.nominal_mm)
         return (
             "Measure again, from the first to the last point of the longest row, not to the edges of squares or paper; "
-            f"if the printer scaled the sheet, state its spacing as it is: {fits:.4g} mm instead of {spacing:g}"
+            f"if the printer scaled the sheet, state its spacing as it is: {fits} instead of {spacing:g}"
             + (" (and leave --rigid out if it is a print)" if exact else "")
         )
 
@@ -88,7 +88,7 @@ def stated_length(given: tuple[float, float] | None, target: Target) -> Length |
             f"the stated length of {mm:g} mm does not fit the target: from the first to the last of its longest row "
             f"are {nominal:g} mm, {mm / nominal - 1:+.0%} is more than printers are off",
             hint="measure between the outermost points of the longest row, or correct the target's spacing: "
-            f"{target.spacing_mm * mm / nominal:.4g} mm instead of {target.spacing_mm:g} would fit",
+            f"{_fitting(target.spacing_mm, mm, sigma, nominal)} instead of {target.spacing_mm:g} would fit",
         )
     return Length(*target.longest, mm, max(sigma, 1e-6))
 
@@ -137,6 +137,11 @@ def adjusted_length(problem: Problem, state: State, covariance: Array) -> tuple[
 def is_exact(priors: Priors) -> bool:
     """Whether no stretch and no bow are fitted."""
     return priors.sheet_scale < EXACT
+
+
+def _fitting(spacing: float, stated: float, sigma: float, nominal: float) -> str:
+    """The spacing that a stated length makes, mm, with what that length is unsure by."""
+    return f"{with_uncertainty(spacing * stated / nominal, 2 * spacing * sigma / nominal)} mm (k = 2)"
 
 
 def _print_sigma(priors: Priors, across: Array) -> float:

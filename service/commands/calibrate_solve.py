@@ -252,9 +252,11 @@ def _facts(
     facts.append(("rotation", f"{told} degrees, the vector about which the projector is turned"))
     shift, s = state.translation, spread["translation"]
     scale = content["scale"]
-    relative = "; relative to the target's stated size: scale unverified" if scale == "unverified" else ""
-    told = ", ".join(_stated(v, e) for v, e in zip(shift, s, strict=True))
-    facts.append(("translation", f"{told} mm{relative}"))
+    if scale == "unverified":
+        facts.append(("translation", _unverified(shift.tolist())))
+    else:
+        told = ", ".join(_stated(v, e) for v, e in zip(shift, s, strict=True))
+        facts.append(("translation", f"{told} mm"))
     facts.append(("sheet", _sheet(solution)))
     if content["covariance"] is not None:
         facts.append(("+-", f"expanded uncertainty, k = 2, of each of these figures{_widened(solution.widened)}"))
@@ -275,6 +277,13 @@ def _facts(
     return facts if drawing is None else [*facts, ("picture", drawing)]
 
 
+def _unverified(shift: Sequence[float]) -> str:
+    """A translation whose scale nobody measured: as many digits as show what it is, and no uncertainty."""
+    places = max(0, 2 - math.floor(math.log10(math.hypot(*shift))))
+    told = ", ".join(rounded(v, places) for v in shift)
+    return f"{told} mm if the target has the size it was stated with: scale unverified, uncertainty unknown"
+
+
 def _widened(times: float) -> str:
     """Why uncertainties are larger than residuals and the stated length alone make them; nothing where they are not."""
     if times < NOTABLE_WIDENING:
@@ -293,7 +302,8 @@ def _sheet(solution: Solution) -> str:
     if is_exact(solution.problem.priors):
         return "taken as exact: no stretch and no bow are fitted"
     x, y, bow = (_stated(v, e) for v, e in zip(solution.state.sheet, sigmas(solution.adjusted)["sheet"], strict=True))
-    return f"scale x {x}, scale y {y} of its nominal size, bow {bow} mm"
+    unmeasured = "" if solution.problem.length is not None else "; its size is that of prints, not measured"
+    return f"scale x {x}, scale y {y} of its nominal size, bow {bow} mm{unmeasured}"
 
 
 def _scale(solution: Solution) -> str:
