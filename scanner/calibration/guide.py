@@ -187,12 +187,7 @@ class Guide:
         return f"at the {FIELDS[field]} of the picture, its {side} towards the camera"
 
     def _fields(self, poses: tuple[Seen, ...]) -> NDArray[np.bool_]:
-        covered = np.zeros(9, dtype=bool)
-        for pose in poses:
-            share = (pose.points + 0.5) / self.size
-            at = (share > OUTER).astype(int) + (share > 1 - OUTER)
-            covered[3 * at[:, 1] + at[:, 0]] = True
-        return covered
+        return fields_of(np.concatenate([np.empty((0, 2)), *(pose.points for pose in poses)]), self.size)
 
 
 class Stillness:
@@ -214,6 +209,15 @@ class Stillness:
         while len(self._seen) > 1 and t_s - self._seen[1][0] >= STILL_S:
             self._seen.popleft()
         return t_s - self._seen[0][0] >= STILL_S
+
+
+def fields_of(points: Array, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """(9,) which fields of a picture hold any of these points, (N, 2) px, row by row."""
+    covered = np.zeros(9, dtype=bool)
+    share = (points + 0.5) / size
+    at = (share > OUTER).astype(int) + (share > 1 - OUTER)
+    covered[3 * at[:, 1] + at[:, 0]] = True
+    return covered
 
 
 def moved(here: Sight | Seen, there: Sight | Seen) -> float:

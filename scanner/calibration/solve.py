@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from scanner.calibration.adjustment import Adjusted
 from scanner.calibration.agreement import agreed
+from scanner.calibration.coverage import not_met
 from scanner.calibration.drift import epipolar_offsets
 from scanner.calibration.held_out import HeldOut, hold_out
 from scanner.calibration.lens_slopes import rotation_of
@@ -257,6 +258,8 @@ def _warnings(solution: Solution) -> list[str]:
                 f"the poses cover {span[0]:.0%} x {span[1]:.0%} of the {side}'s picture: "
                 "what lies outside is extrapolated"
             )
+    if lacking := not_met(problem, adjusted.state):
+        warnings.append(lacking)
     dropped = sum(int((~k).sum()) for k in adjusted.kept)
     total = sum(len(k) for k in adjusted.kept)
     if dropped > 0.1 * total:

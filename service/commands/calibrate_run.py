@@ -88,7 +88,7 @@ def run(
 
     \b
     Examples:
-      fringed calibrate run "simulated:charuco_poses?walk=true&seed=87" --target charuco:10x7:30 --auto -o scans/rig
+      fringed calibrate run "simulated:charuco_poses?walk=true&seed=198" --target charuco:10x7:30 --auto -o scans/rig
       fringed calibrate run bench.toml --target charuco:10x7:30 --length 240.1:0.05 -o calibrations/bench
       fringed calibrate run bench.toml --target charuco:10x7:30 --auto --write
     """
@@ -156,9 +156,12 @@ def _guided(
             with keys() as pressed:
                 loop = _Loop(session, asked, pressed, levels)
                 loop.run()
-            _say_lacking(session.guide, simulated=rig is not None and is_simulated(rig))
             with progress_lines() as lines:
-                return session.solved(leave_out=True, progress=lines.stage), loop.response
+                try:
+                    return session.solved(leave_out=True, progress=lines.stage), loop.response
+                except ScannerError:  # else its warnings say so
+                    _say_lacking(session.guide, simulated=rig is not None and is_simulated(rig))
+                    raise
         except (KeyboardInterrupt, ScannerError):
             if session.observations:
                 say(f"the poses are kept: the same command with -o {asked.folder} goes on with them")
@@ -339,9 +342,11 @@ def _response(session: GuidedCalibration, levels: LevelResponse | None) -> dict[
 
 def _say_lacking(guide: Guide | None, *, simulated: bool = False) -> None:
     """Which of the how-to's conditions the poses do not meet, in one line."""
+    from scanner.calibration.coverage import NOT_MET  # noqa: PLC0415
+
     if guide is not None and (lacking := guide.lacking()):
         why = "; a simulated target's poses are drawn from its seed: other ones with seed=N" if simulated else ""
-        say(f"not met of what a calibration asks for: {lacking}{why}")
+        say(f"{NOT_MET}{lacking}{why}")
 
 
 def _written(
