@@ -91,6 +91,7 @@ def report_of_capture(capture: Capture) -> dict[str, Any]:
         "frames": len(capture.records),
         "shows": Counter(str(header.sequence.role(n)) for n in range(len(header.sequence))),
         "missing": list(capture.missing),
+        "retaken": sorted(pattern for pattern, record in capture.records.items() if record.attempt),
         "state": header.state,
         "reason": header.reason,
         "repeat": header.repeat,

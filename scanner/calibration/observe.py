@@ -58,6 +58,8 @@ class LeftOut:
     name: str
     reason: str
     out_of_step: bool = False
+    unreadable: bool = False
+    """its frames cannot be read or decoded; what they show was not looked at"""
 
 
 def find_captures(paths: Sequence[Path]) -> list[Path]:
@@ -138,7 +140,8 @@ def observe_capture(path: Path, name: str, target: Target) -> Observation | Left
     except SyncError as error:
         return LeftOut(name, f"frames out of step: {error}", out_of_step=True)
     except ScannerError as error:
-        return LeftOut(name, str(error) if error.hint is None else f"{error}; {error.hint}")
+        said = str(error) if error.hint is None else f"{error}; {error.hint}"
+        return LeftOut(name, said.replace(f"{path}/", ""), unreadable=True)
     view = observe_decoded(name, decoded, target, white=white, mosaic=capture.header.camera.mosaic is not None)
     if isinstance(view, LeftOut):
         return view

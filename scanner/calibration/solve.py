@@ -215,15 +215,20 @@ def _require_views(target: Target, observations: Sequence[Observation], out: Seq
     if len(observations) >= needed:
         return
     every = len(observations) + len(out)
-    reasons = sorted({o.reason for o in out}, key=lambda r: -sum(o.reason == r for o in out))
+    names: dict[str, list[str]] = {}
+    for one in out:
+        names.setdefault(one.reason, []).append(one.name)
     message = f"{len(observations)} of {every} captures can be used, {needed} are needed"
     if out and all(o.out_of_step for o in out):
         raise CalibrationError(
             f"{message}: frames and patterns are out of step ({out[0].name}: {out[0].reason})",
             hint="look at a capture with fringed audit; measure the projector's latency, then capture again",
         )
-    if reasons:
-        message += ". " + "; ".join(f"{sum(o.reason == r for o in out)} x {r}" for r in reasons[:4])
+    if names:
+        most = sorted(names.items(), key=lambda item: -len(item[1]))[:4]  # as captured, where as many have them
+        message += ". " + "; ".join(f"{len(by)} x {why}" if len(by) > 1 else f"{by[0]}: {why}" for why, by in most)
+    if out and all(o.unreadable for o in out):
+        raise CalibrationError(message, hint="copy these folders again from where they were taken, or capture again")
     raise CalibrationError(
         message, hint=f"the target looked for is {target.spec}; capture it in 10 to 20 poses, both axes"
     )

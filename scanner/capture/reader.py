@@ -106,7 +106,7 @@ class Capture:
             return f"{lines} says that the frame of pattern {last.pattern} is {last.status}"
         if last.slot >= len(self._slots):
             return f"{lines} names slot {last.slot}, and {FRAMES_FILE} has {len(self._slots)} from 0"
-        return f"the pixels of {frames}, slot {last.slot}, are not those that the digest in {RECORDS_FILE} was made of"
+        return self._altered((last.slot,))
 
     @property
     def missing(self) -> tuple[int, ...]:
@@ -120,7 +120,26 @@ class Capture:
             return None
         named, more = ", ".join(map(str, self.missing[:MOST_NAMED])), len(self.missing) - MOST_NAMED
         frames = f"frame{'s' if len(self.missing) > 1 else ''} {named}{f' and {more} more' if more > 0 else ''}"
-        return f"{frames} of {self.header.frame_count} lost: {self.fault(self.missing[0])}"
+        return f"{frames} of {self.header.frame_count} lost: {self._faults()}"
+
+    def _faults(self) -> str:
+        """What is to blame for missing frames: for all of them where it is their pixels, else for the first."""
+        last = {record.pattern: record for record in self.all_records}
+        there = 0 if self._slots is None else len(self._slots)
+        found = [last[pattern] for pattern in self.missing if pattern in last]
+        slots = [r.slot for r in found if r.status == "ok" and r.slot is not None and r.slot < there]
+        if len(slots) == len(self.missing):
+            return self._altered(slots)
+        why = self.fault(self.missing[0])
+        return why if len(self.missing) == 1 else f"{why} (frame {self.missing[0]})"
+
+    def _altered(self, slots: Sequence[int]) -> str:
+        named, more = ", ".join(map(str, slots[:MOST_NAMED])), len(slots) - MOST_NAMED
+        pixels = f"the pixels of {self.path / FRAMES_FILE}"
+        if len(slots) == 1:
+            return f"{pixels}, slot {named}, are not those that the digest in {RECORDS_FILE} was made of"
+        which = f"slots {named}{f' and {more} more' if more > 0 else ''}"
+        return f"{pixels}, {which}, are not those that the digests in {RECORDS_FILE} were made of"
 
     @property
     def calibration_path(self) -> Path | None:

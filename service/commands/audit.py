@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from service.commands.calibrate_solve import Replace
-from service.commands.options import AsJson, output_path
+from service.commands.options import AsJson, output_path, require_free
 from service.terminal import print_error, print_facts, print_json, print_table, progress_lines
 
 if TYPE_CHECKING:
@@ -45,8 +45,7 @@ def audit(
     """
     if output is not None and output.suffix not in (".svg", ".png"):
         raise typer.BadParameter(f"-o: expected a name that ends in .svg or .png, got {str(output)!r}")
-    if output is not None and output.exists() and not force:
-        raise typer.BadParameter(f"-o: {output} exists; --force replaces it")
+    require_free(output, force=force)
     with progress_lines() as lines:
         lines.stage("reading frames")
         from scanner.capture import Capture  # noqa: PLC0415

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from service.commands.calibrate_solve import Replace
-from service.commands.options import AsJson, output_path
+from service.commands.options import AsJson, output_path, require_free
 from service.terminal import print_facts, print_json, progress_lines
 
 
@@ -38,8 +38,7 @@ def marks(
       fringed calibrate marks scan --plate 20,20,160,120 -o scans/marks.json      the simulated wall as plate
       fringed calibrate marks today/ --at 80,90 --at 1300,95 --at 690,980 -o marks.json
     """
-    if output.exists() and not force:
-        raise typer.BadParameter(f"-o: {output} exists; --force replaces it")
+    require_free(output, force=force)
     places = [_numbers(text, 2, "--at") for text in at or ()]
     region = None if plate is None else region_given(plate, "--plate")
     with progress_lines() as lines:

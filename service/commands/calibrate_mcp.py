@@ -9,7 +9,7 @@ import typer
 
 from scanner.digits import with_uncertainty
 from service.commands.calibrate_solve import Replace
-from service.commands.options import AsJson, output_path
+from service.commands.options import AsJson, output_path, require_free
 from service.terminal import print_error, print_facts, print_json
 
 if TYPE_CHECKING:
@@ -43,8 +43,7 @@ def mcp(
     """
     if (calibration is None) != (output is None):
         raise typer.BadParameter("--calibration FILE and -o FILE belong together")
-    if output is not None and output.exists() and not force:
-        raise typer.BadParameter(f"-o: {output} exists; --force replaces it")
+    require_free(output, force=force)
     from scanner.calibration.calibration_file import as_text  # noqa: PLC0415
     from scanner.calibration.mcp_phase import mcp_phase  # noqa: PLC0415
     from scanner.calibration_id import content_id  # noqa: PLC0415

@@ -12,7 +12,7 @@ import typer
 
 from scanner.digits import rounded, with_uncertainty
 from scanner.stated_length import dominates, stated_length_of
-from service.commands.options import AsJson, output_path
+from service.commands.options import AsJson, output_path, require_free
 from service.terminal import print_error, print_facts, print_json, print_table, progress_lines
 
 if TYPE_CHECKING:
@@ -106,10 +106,7 @@ def solve(
     """
     stated = None if length is None else length_given(length)
     drawing = output.with_suffix(".png") if picture else None
-    if not force:
-        for path in (output, drawing):
-            if path is not None and path.exists():
-                raise typer.BadParameter(f"-o: {path} exists; --force replaces it")
+    require_free(output, drawing, force=force)
     with progress_lines() as lines:
         lines.stage("opening captures")
         from scanner.calibration.calibration_file import as_text, calibration_dict  # noqa: PLC0415

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.commands.calibrate_solve import TARGET_HELP, Replace
-from service.commands.options import AsJson, output_path
+from service.commands.options import AsJson, output_path, require_free
 from service.terminal import print_error, print_facts, print_json
 
 if TYPE_CHECKING:
@@ -49,8 +49,7 @@ def target(
     """
     if output.suffix != ".svg":
         raise typer.BadParameter(f"-o: expected a name that ends in .svg, got {str(output)!r}")
-    if output.exists() and not force:
-        raise typer.BadParameter(f"-o: {output} exists; --force replaces it")
+    require_free(output, force=force)
     from scanner.calibration.target_svg import target_svg  # noqa: PLC0415
     from scanner.calibration.targets import parse_target  # noqa: PLC0415
     from scanner.storage import replace_file, storage_errors  # noqa: PLC0415

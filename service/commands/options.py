@@ -24,6 +24,19 @@ def output_path(text: str) -> Path:
     return Path(text)
 
 
+def require_free(*files: Path | None, force: bool) -> None:
+    """Refuse files to write (None: none) that are folders, or that are there and not to be replaced.
+
+    Raises:
+        typer.BadParameter: with what would help.
+    """
+    for file in files:
+        if file is not None and file.is_dir():
+            raise typer.BadParameter(f"-o: {file} is a folder, a file is to be written: give another name")
+        if file is not None and file.exists() and not force:
+            raise typer.BadParameter(f"-o: {file} exists; --force replaces it")
+
+
 OutputFolder = Annotated[
     Path | None,
     typer.Option("-o", "--output", metavar="DIR", parser=output_path, help="Folder to write to; refused unless empty."),

@@ -136,12 +136,13 @@ def _frames(capture: Mapping[str, Any]) -> list[tuple[str, str]]:
     """How many frames, and what those are for that the pattern itself does not account for."""
     shows: Mapping[str, int] = capture.get("shows") or {}
     others = [words.format(shows[role]) for role, words in _FOR.items() if shows.get(role)]
+    again = f"; {len(capture['retaken'])} taken again" if capture.get("retaken") else ""
     if not others:
         return []
     repeated = f", {capture['repeat']} times" if capture.get("repeat", 1) > 1 else ""
     missing = f"; {len(capture['missing'])} missing" if capture.get("missing") else ""
     fringes = shows.get("fringe", 0)
-    return [("frames", f"{fringes} of the pattern, {', '.join(others)}{repeated}{missing}")]
+    return [("frames", f"{fringes} of the pattern, {', '.join(others)}{repeated}{again}{missing}")]
 
 
 def _few(coverage: Mapping[str, Any]) -> str:

@@ -181,6 +181,8 @@ def test_frames_that_do_not_match_their_digests_are_named(poses: Path, tmp_path:
         assert isinstance(found, LeftOut)
         slot = 0 if name == "part" else len(frames) - 1
         assert f"frames.npy, slot {slot}, are not those that the digest in frames.jsonl was made of" in found.reason
+        assert found.unreadable
+        assert str(tmp_path) not in found.reason, "captures that lack the same have the same reason"
 
 
 def test_a_pose_that_serves_without_a_frame_says_so(poses: Path, tmp_path: Path) -> None:

@@ -359,6 +359,11 @@ def test_too_few_captures_say_why() -> None:
     late = [LeftOut(name, "frames out of step: frames 3, 4", out_of_step=True) for name in "abc"]
     with pytest.raises(CalibrationError, match="out of step"):
         calibrate(TARGET, [], LENGTH, late)
+    lost = [LeftOut(name, f"frames lost: slot {name}", unreadable=True) for name in ("0", "1", "3")]
+    with pytest.raises(CalibrationError) as error:
+        calibrate(TARGET, [], LENGTH, lost)
+    assert str(error.value).endswith(". 0: frames lost: slot 0; 1: frames lost: slot 1; 3: frames lost: slot 3")
+    assert error.value.hint == "copy these folders again from where they were taken, or capture again"
 
 
 def test_wrong_columns_and_rows_fit_no_rig() -> None:

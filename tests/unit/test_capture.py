@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -104,6 +105,22 @@ def test_the_last_whole_line_of_a_pattern_wins_and_a_wrong_digest_does_not_exist
     capture = Capture.open(tmp_path / "c")
     assert sorted(capture.records) == [1]
     np.testing.assert_array_equal(capture.frame(1), frame(100))
+
+
+@pytest.mark.parametrize(
+    ("absent", "said"), [(False, r", slots 1, 2, are not .* were made of$"), (True, r"\(frame 1\)$")]
+)
+def test_what_is_lost_is_explained_for_all_frames_or_for_the_one_that_is_named(
+    tmp_path: Path, absent: bool, said: str
+) -> None:
+    writer = CaptureWriter(tmp_path / "c", header(), len(SEQUENCE))
+    for pattern in range(len(SEQUENCE) - absent):
+        slot, xxh3 = writer.write(frame(pattern))
+        writer.record(FrameRecord(slot, pattern, xxh3=digest(frame(99)) if pattern in (1, 2) else xxh3))
+    writer.close("complete")
+    lost = Capture.open(tmp_path / "c").lost
+    assert lost is not None
+    assert re.search(said, lost)
 
 
 def test_a_record_round_trips_through_its_line() -> None:

@@ -102,6 +102,27 @@ def test_wrong_usage_is_2_and_says_what(words: list[str], said: str, run: Run, t
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("calibrate", "solve", "x", "--target", "chessboard:9x6:30"),
+        ("calibrate", "marks", "x", "--at", "1,1"),
+        ("calibrate", "mcp", "x", "y", "--calibration", "z"),
+        ("calibrate", "target", "chessboard:9x6:30"),
+        ("audit", "x"),
+    ],
+)
+def test_a_folder_in_a_files_place_is_not_to_be_replaced(
+    words: tuple[str, ...], force: bool, run: Run, tmp_path: Path
+) -> None:
+    (tmp_path / "there.svg").mkdir()
+    status, _, err = run(*words, "-o", tmp_path / "there.svg", *(["--force"] if force else []))
+    assert status == 2
+    assert "is a folder, a file is to be written: give another name" in " ".join(err.split())
+    assert "replaces" not in err
+
+
 def test_no_daemon_says_how_to_start_one(run: Run, tmp_path: Path) -> None:
     status, out, err = run("status", "--connect", f"ipc://{tmp_path}/none.ipc")
     assert (status, out) == (1, "")

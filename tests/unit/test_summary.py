@@ -31,7 +31,12 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
     report = {
         "points": 9,
         "cannot_reveal": ["a late set (no order bars)", "small blends"],
-        "capture": {"frames": 18, "shows": {"sentinel": 6, "white": 1, "black": 1, "fringe": 1}, "repeat": 2},
+        "capture": {
+            "frames": 18,
+            "shows": {"sentinel": 6, "white": 1, "black": 1, "fringe": 1},
+            "repeat": 2,
+            "retaken": [3, 4],
+        },
         "coverage": {"lit": 0.99, "points_of_lit": 0.2},
         "depth_mm": {"p1": 1.0, "p99": 2.0},
         "uncertainty": {
@@ -56,7 +61,10 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
     report_result(tmp_path, 1.0, {}, as_json=False)
     printed, said = capsys.readouterr()
     assert "note: the stated length 240.00 +- 0.10 mm (k = 2) dominates, with 97% of the variance" in said
-    assert "1 of the pattern, 1 white, 1 black, 6 black and white around them that prove the timing, 2 times" in printed
+    assert (
+        "1 of the pattern, 1 white, 1 black, 6 black and white around them that prove the timing, 2 times; " in printed
+    )
+    assert "; 2 taken again\n" in printed
     assert "99.0% of the pixels in which the pattern shows, 20.0% keep a point" in printed
     assert "cannot reveal  a late set (no order bars); small blends\n" in printed
     assert "(7 px and more from edges)" in printed
