@@ -167,7 +167,7 @@ def _uncertainty(budget: Mapping[str, Any], few: str) -> tuple[str, str] | None:
             "the median point); the method's own error is not known and larger: see docs/explanation/uncertainty.md"
         )
     else:
-        text = f"+-{within} mm {at}, of 95 in 100 points{few}: the one to quote; {_of_median(budget)}"
+        text = f"+-{within} mm holds 95 in 100 points{few}, {at}: quote this figure; {_of_median(budget)}"
     return "uncertainty", f"{text}{f'; unknown, and not in it: {unknown}' if unknown else ''}"
 
 
@@ -180,4 +180,6 @@ def _of_median(budget: Mapping[str, Any]) -> str:
     parts = {kind: k * budget[f"{kind}_mm"] for kind in ("random", "systematic") if budget[f"{kind}_mm"]}
     words = [f"+-{alone(part)} mm {kind}" for kind, part in parts.items()]
     words += [f"mostly {dominant['name']}"] if (dominant := budget.get("dominant")) else []
-    return f"the median one +-{alone(math.hypot(*parts.values()))} mm: {', '.join(words)} (k = {k:.3g})"
+    return (
+        f"a point of median uncertainty has +-{alone(math.hypot(*parts.values()))} mm (k = {k:.3g}): {', '.join(words)}"
+    )

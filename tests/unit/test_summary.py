@@ -70,8 +70,14 @@ def test_figures_say_what_they_are_of(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "(7 px and more from edges)" in printed
     assert "0.683 mm rms, 0.400 mm in 99 of 100 points (all that is lit, edges too, 0.12% of them wrong; " in printed
     assert "wrong; not the 1,234 that the truth has no light for)" in printed
-    assert "+-0.16 mm at 700 mm, of 95 in 100 points that there are, 20.0% of the pixels in which the" in printed
-    assert "the median one +-0.14 mm: +-0.14 mm random, +-0.034 mm systematic, mostly noise (k = 2)" in printed
+    assert (
+        "+-0.16 mm holds 95 in 100 points that there are, 20.0% of the pixels in which the pattern shows, at 7"
+        in printed
+    )
+    assert (
+        ": quote this figure; a point of median uncertainty has +-0.14 mm (k = 2): +-0.14 mm random, +-0.034 mm "
+        in printed
+    )
     assert "unknown, and not in it: calibration" in printed
     assert "0 points off by half a fringe or stripe, or by 20 mm; 12 with those at edges" in printed
 
@@ -111,8 +117,11 @@ def test_what_a_method_adds_unknown_gets_no_figure_of_the_whole(
     (tmp_path / "report.json").write_text(json.dumps(report), encoding="utf-8")
     report_result(tmp_path, 1.0, {}, as_json=False)
     printed = capsys.readouterr().out
-    assert "+-0.20 mm at 700 mm, of 95 in 100 points: the one to quote; the median one +-0.14 mm: +-0.14" in printed
-    assert "+-0.14 mm random (k = 2); unknown, and not in it: calibration, print" in printed
+    assert (
+        "+-0.20 mm holds 95 in 100 points, at 700 mm: quote this figure; a point of median uncertainty has +-0.14"
+        in printed
+    )
+    assert "(k = 2): +-0.14 mm random; unknown, and not in it: calibration, print" in printed
     assert "unknown, and not in it: calibration, print" in printed
     assert "systematic" not in printed, "nothing is known of it: that is no 0"
 
