@@ -7,7 +7,7 @@ may be changing), the flips, and the exposures in the colour of their verdict, w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Literal
 
@@ -96,7 +96,7 @@ def draw(check: CaptureCheck) -> tuple[list[Shape], int]:
     shapes += _legend(plan)
     flips = sorted({r.flip.t_ns for r in stamped if r.flip is not None})
     origin = flips[0]
-    verdicts = {v.pattern: v for v in check.verdicts}
+    verdicts = {v.pattern: _with_picture(check, v) for v in check.verdicts}
     final = {r.pattern: r for r in check.capture.all_records}
     bands = [stamped[i : i + FRAMES_A_BAND] for i in range(0, len(stamped), FRAMES_A_BAND)]
     for index, records in enumerate(bands):
@@ -189,6 +189,14 @@ class _Band:
         if verdict is None and x1 - x0 > 4:
             shapes.append(Box(x0 + 1.5, y + 1.5, x1 - x0 - 3, 11, PAPER))
         return shapes
+
+
+def _with_picture(check: CaptureCheck, verdict: FrameVerdict) -> FrameVerdict:
+    """A verdict by time stamps, with what the frame's picture says against it."""
+    against = check.against(verdict.pattern % len(check.capture.header.sequence))
+    if not against:
+        return verdict
+    return replace(verdict, suspect=True, reasons=(*verdict.reasons, f"its picture: against {', '.join(against)}"))
 
 
 def _legend(plan: Plan) -> list[Shape]:

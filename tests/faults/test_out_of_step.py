@@ -17,7 +17,7 @@ from scanner.empty_scan import raise_if_empty
 from scanner.errors import DecodeError, DeviceLost, SyncError
 from scanner.patterns import PatternSequence, PmpPattern
 from scanner.reconstruct import reconstruct
-from scanner.sequencer import FinishReason, check_capture
+from scanner.sequencer import FinishReason, check_capture, timing_diagram
 from service import cli
 from tests.unit.sequencer_bench import Taken, gray, pmp, take
 
@@ -323,6 +323,11 @@ def test_the_scan_and_the_audit_name_the_same_frames_and_none_of_them_is_called_
         said = "against: " + ", ".join(frame["against"]) if frame["against"] else "order in doubt"
         assert (frame["verdict"], bool(frame["against"])) == ("proved", position in check.suspects)
         assert lines[position].split(maxsplit=3)[2:] == ["proved", said]
+    drawn = timing_diagram(check).decode()
+    for position in range(len(EIGHT)):
+        tip = re.search(rf"<title>frame {position}, (?!.*taken again).*</title>", drawn)
+        assert tip is not None
+        assert ("suspect; its picture: against " in tip[0]) == (position in check.suspects)
     assert re.search(rf"^by pictures +{len(check.suspects)} of {len(EIGHT)} contradicted$", out, re.MULTILINE)
 
 
