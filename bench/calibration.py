@@ -35,7 +35,8 @@ from drivers.registry import open_camera, open_projector
 from drivers.simulated.rigs import reference
 from drivers.simulated.rigs import rig as simulated_rig
 from drivers.simulated.targets import wedge_planes, wedge_points
-from scanner.calibration.figure_spread import SPHERE, noise_alone
+from scanner.calibration.beyond_noise import beyond_noise
+from scanner.calibration.figure_spread import SPHERE
 from scanner.calibration.hall import triangulate_hall
 from scanner.calibration.lens_slopes import lens_numbers
 from scanner.calibration.observe import LeftOut, Observation, observe_capture, observe_decoded
@@ -174,7 +175,8 @@ def spheres(chosen):
             made.xyz[~inside] = np.nan
             on = sphere_points(made.xyz, 2 * radius)
             found = measured_sphere(on, 2 * radius)
-            noise = noise_alone(on, made.sigma_z, SPHERE)["form_mm"]
+            told = beyond_noise(SPHERE.deviations(on.points).off, on.at, truth.lit.shape, SPHERE.widths["form_mm"])
+            noise = float("nan") if told is None else told.noise_mm
             print(
                 f"{name:11} {found.size_mm / 2:+17.4f} {found.rms_mm:8.4f} {found.shell_mm:9.4f} {found.form_mm:16.4f} "
                 f"{noise:19.4f} {found.points:8}",

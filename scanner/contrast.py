@@ -80,24 +80,6 @@ def widen_at_edges(scan: Scan, phase_axis: str, blur_variance_px2: float | None 
     )
 
 
-def sigma_z_that_scatters(scan: Scan, phase_axis: str) -> Map | None:
-    """(H, W) mm: a scan's `sigma_z` without what `widen_at_edges` added, which is the same in every scan of a scene.
-
-    Args:
-        scan: as it was saved, or made; of methods that are not widened it is `sigma_z`. phase_axis: as there.
-    """
-    name = "rows" if scan.columns is None or (scan.rows is not None and phase_axis == "y") else "columns"
-    values, sigma = getattr(scan, name), getattr(scan, f"sigma_{name}")
-    if scan.sigma_z is None or values is None or sigma is None or "camera_blur_px" not in scan.report:
-        return scan.sigma_z
-    measured = scan.report["camera_blur_px"]
-    variance = BLUR_VARIANCE_PX2 if measured is None else float(measured) ** 2
-    pull, _ = _widened(values, np.zeros_like(sigma), scan.modulation, variance, None)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        share = np.sqrt(np.maximum(1 - (pull / sigma) ** 2, 0))
-    return np.asarray(scan.sigma_z * share, dtype=np.float32)
-
-
 def blur_variance_of(values: Map, sigma: Map, modulation: Map) -> float | None:
     """The variance of the camera's blur, squared camera pixels, by which brightness pulls coordinates here.
 

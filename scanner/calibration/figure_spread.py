@@ -42,13 +42,6 @@ FEWEST_OF_TARGET = 12
 """Points of a target by which the places of its marks are judged: an affine map takes twelve numbers from 36"""
 LIKELY = 0.95
 """Of all rigs that a covariance allows: those whose parameters are not farther from the calibration's"""
-APART = 2
-"""Pixels between points whose difference tells noise: near enough to share the feature's form, too far to share what
-a colour camera's or a driver's own smoothing makes of one pixel"""
-FEWEST_PAIRS = 1000
-"""They tell noise to 4 %."""
-MEDIAN_OF_NORMAL = 0.6745
-"""Median size of a normal error, in sigmas"""
 _SEED = 2634
 
 Figures = Callable[[Array], Mapping[str, float]]
@@ -70,10 +63,14 @@ class Spread:
     @property
     def expanded(self) -> float | None:
         """U, k = 2; None where one of them is unknown."""
-        if self.random is None or self.calibration is None:
+        if self.random is None or self.of_calibration is None:
             return None
-        reach = COVERAGE_FACTOR * self.calibration if self.reach is None else self.reach
-        return float(np.hypot(COVERAGE_FACTOR * self.random, reach))
+        return float(np.hypot(COVERAGE_FACTOR * self.random, self.of_calibration))
+
+    @property
+    def of_calibration(self) -> float | None:
+        """The calibration's part of U."""
+        return COVERAGE_FACTOR * self.calibration if self.reach is None and self.calibration is not None else self.reach
 
     def as_dict(self) -> dict[str, float | None]:
         """For documents."""
@@ -201,47 +198,6 @@ def spread_of_length(found: Detection, target: Target, xyz: NDArray[np.float32],
         covariance = moves.covariance
     apart = slopes[1] - slopes[0]
     return Spread(random, float(np.sqrt(max(float(apart @ covariance @ apart), 0.0))))
-
-
-def noise_alone(
-    on: FeaturePoints, sigma_z: NDArray[np.float32], feature: Feature, *, independent: bool = False
-) -> dict[str, float]:
-    """The figures that a perfect feature would have in this scan, by the noise of its points alone.
-
-    Args:
-        on: its points. sigma_z: (H, W) mm, of what scatters. feature: its kind.
-        independent: each pixel was decoded by itself, so that how much near points differ tells the noise: sigmas
-            then say only where there is more of it and where less.
-    """
-    found = feature.deviations(on.points)
-    ideal = on.points - found.off[:, None] * found.normals
-    # A point moves along its ray: by as much of that as goes along the normal.
-    across = np.abs((on.points / on.points[:, 2:] * found.normals).sum(axis=1))
-    sigma = across * np.nan_to_num(sigma_z.reshape(-1)[on.at].astype(np.float64))
-    if independent:
-        sigma *= _noise_over(sigma, found.off, on.at, sigma_z.shape)
-    off = sigma * np.random.default_rng(_SEED).normal(size=len(sigma))
-    return dict(feature.figures(ideal + off[:, None] * found.normals))
-
-
-def _noise_over(sigma: Array, off: Array, at: NDArray[np.intp], shape: tuple[int, ...]) -> float:
-    """How many times its stated sigmas the noise of deviations is, as points APART from each other differ.
-
-    Of the factors along the picture's lines and down its columns the smaller: fringes that ripple run along one of
-    them, and a ripple is no noise. 1 where too few pairs tell.
-    """
-    number = np.full(shape, -1)
-    number.reshape(-1)[at] = np.arange(len(at))
-    factors = []
-    for here, there in ((number[:, :-APART], number[:, APART:]), (number[:-APART], number[APART:])):
-        pairs = (here >= 0) & (there >= 0)
-        one, other = here[pairs], there[pairs]
-        stated = np.hypot(sigma[one], sigma[other])
-        known = stated > 0
-        if known.sum() >= FEWEST_PAIRS:
-            apart = np.abs(off[one] - off[other])[known] / stated[known]
-            factors.append(float(np.median(apart)) / MEDIAN_OF_NORMAL)
-    return min(factors, default=1.0)
 
 
 def _of_width(off: Array, left_out: float) -> float:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from scanner.calibration.beyond_noise import beyond_noise
 from scanner.calibration.edges import edge_width
 from scanner.calibration.figure_spread import (
     BOARD,
@@ -19,7 +20,7 @@ from scanner.calibration.figure_spread import (
     SPHERE,
     Feature,
     Rig,
-    noise_alone,
+    Spread,
     spread_of_figures,
     spread_of_length,
 )
@@ -38,7 +39,6 @@ from scanner.calibration.verification import (
     target_ends,
 )
 from scanner.capture import Capture
-from scanner.contrast import sigma_z_that_scatters
 from scanner.errors import DecodeError, ScannerError
 from scanner.geometry import Calibration, load_calibration
 from scanner.scan import Scan
@@ -59,7 +59,7 @@ NOISE_OF = {"flatness_mm": "noise_mm", "form_mm": "noise_mm", "shell_mm": "shell
 
 BY_PIXEL = ("pmp", "gray+pmp")
 """Methods that decode each pixel by itself. Others' sigmas are of cells, or of relief between stripes, which are no
-noise: a simulated board would be said to have 1.6 (Gray code) and 6 times (MCP) the flatness by noise that it has"""
+noise, and neighbours err alike"""
 
 
 @dataclass(frozen=True)
@@ -92,13 +92,11 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
         _require_within(wanted.edge, scan)
     if wanted.flat:
         board = board_points(scan.xyz)
-        found["flat"] = plain(measured_board(board)) | _of_noise(board, scan, BOARD, rig)
-        found["flat"]["uncertainty"] = _spreads(spread_of_figures(board, scan.shape[1], BOARD, rig))
+        found["flat"] = _with_noise(plain(measured_board(board)), board, scan, BOARD, rig)
     if wanted.sphere_mm is not None:
         ball = sphere_points(scan.xyz, wanted.sphere_mm)
-        spreads = _spreads(spread_of_figures(ball, scan.shape[1], SPHERE, rig))
-        found["sphere"] = plain(measured_sphere(ball, wanted.sphere_mm)) | _of_noise(ball, scan, SPHERE, rig)
-        found["sphere"]["uncertainty"] = {**spreads, "size_mm": spreads["diameter_mm"]}
+        found["sphere"] = _with_noise(plain(measured_sphere(ball, wanted.sphere_mm)), ball, scan, SPHERE, rig)
+        found["sphere"]["uncertainty"]["size_mm"] = found["sphere"]["uncertainty"]["diameter_mm"]
     if wanted.target is not None:
         seen, ends = target_ends(scan.albedo, scan.xyz, wanted.target)
         of_length = spread_of_length(seen, wanted.target, scan.xyz, rig).as_dict()
@@ -201,12 +199,39 @@ def _made_by(rig: Rig, scan: Scan) -> bool:
     return bool(np.median(np.abs(seen - values.reshape(-1)[at])) < SAME_PX + noise)
 
 
-def _of_noise(on: FeaturePoints, scan: Scan, feature: Feature, rig: Rig | None) -> dict[str, Any]:
-    """Its widths, of a perfect feature in this noise, where that is known."""
+def _with_noise(
+    figures: dict[str, Any], on: FeaturePoints, scan: Scan, feature: Feature, rig: Rig | None
+) -> dict[str, Any]:
+    """The figures with their uncertainties; and of widths what a perfect feature has by noise, and what is beyond."""
+    spreads = spread_of_figures(on, scan.shape[1], feature, rig)
+    found = {**figures, "uncertainty": {name: spread.as_dict() for name, spread in spreads.items()}, "beyond": {}}
     by_pixel = (scan.report.get("decoder") or {}).get("method") in BY_PIXEL
-    sigma = sigma_z_that_scatters(scan, "y" if rig is None else rig.axis) if by_pixel else None
-    alone = None if sigma is None else noise_alone(on, sigma, feature, independent=True)
-    return {NOISE_OF[name]: None if alone is None else alone[name] for name in feature.widths}
+    deviations = feature.deviations(on.points)
+    # A point moves along its ray: by as much of that as goes along the normal.
+    across = (on.points / on.points[:, 2:] * deviations.normals).sum(axis=1)
+    ripple = _rippled(scan) * float(np.sqrt(np.mean(across**2)))
+    for name, left_out in feature.widths.items():
+        told = beyond_noise(deviations.off, on.at, scan.shape, left_out, ripple) if by_pixel else None
+        found[NOISE_OF[name]] = None if told is None else told.noise_mm
+        if told is None:
+            continue
+        found["uncertainty"][NOISE_OF[name]] = Spread(told.noise_random, told.noise_doubt / COVERAGE_FACTOR).as_dict()
+        of_calibration = spreads[name].of_calibration
+        beyond, least, most = told.limits(figures[name], of_calibration or 0.0)
+        known = of_calibration is not None
+        found["beyond"][name] = {
+            "mm": beyond if known or least > 0 else 0.0,
+            "least_mm": least if known else None,
+            "most_mm": most if known else None,
+        }
+    return found
+
+
+def _rippled(scan: Scan) -> float:
+    """What is systematic in a scan besides its calibration, as far as it is known, 1-sigma, mm of depth."""
+    budget = (scan.report.get("uncertainty") or {}).get("contributions") or ()
+    systematic = [one["mm"] for one in budget if one["kind"] == "systematic" and one["name"] != "calibration"]
+    return float(np.sqrt(sum(mm**2 for mm in systematic if mm is not None)))
 
 
 IN_WORDS = {
@@ -232,7 +257,3 @@ def _of_stated(found: dict[str, Any], rig: Rig) -> dict[str, Any] | None:
     share, kind, name = max(shares)
     of = f"{IN_WORDS[name]}, {found[kind][name]:.1f} mm"
     return {"reference_mm": stated.reference_mm, "sigma_mm": stated.sigma_mm, "share": share, "of": of}
-
-
-def _spreads(found: dict[str, Any]) -> dict[str, Any]:
-    return {name: spread.as_dict() for name, spread in found.items()}

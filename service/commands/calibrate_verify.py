@@ -61,8 +61,8 @@ def verify(
     """Measure known features in scans, in the words of VDI/VDE 2634 part 2. All lengths are mm.
 
     Figures of a board, a sphere, a length have an expanded uncertainty (+-, k = 2): of the calibration, by its
-    covariance, and of the points used; --repeat's deviation has one from three scans on. Without one: noise, which is
-    an expectation; --edge; --marks, which say what is allowed; --repeat's drift.
+    covariance, and of the points used; --repeat's deviation has one from three scans on. Without one: --edge;
+    --marks, which say what is allowed; --repeat's drift.
 
     \b
     Examples:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from scanner.digits import UNKNOWN_PLACES, alone, places_of, rounded, with_uncertainty
+from scanner.digits import UNKNOWN_PLACES, alone, rounded, with_uncertainty
 from scanner.stated_length import dominates
 from service.terminal import print_error, print_facts, print_table
 
@@ -38,7 +38,9 @@ def _of_widths(one: dict[str, Any]) -> list[tuple[str, str]]:
         shown = with_uncertainty(width, expanded, known)
         by = "what noise makes of it is not known"
         if noise is not None:
-            by = _beyond(width, noise, expanded, known, kind)
+            of = one[kind]["uncertainty"][of_noise]["expanded"]
+            by = f"a perfect {'board' if kind == 'flat' else kind} has {with_uncertainty(noise, of)} by noise, "
+            by += _beyond(one[kind]["beyond"][name], width / max(one[kind]["beyond"][name]["mm"], LEAST_MM) * known)
         lines.append((called, f"{shown} mm, {norm}; {by}: {one['scan']}"))
     return lines
 
@@ -73,21 +75,17 @@ def _of_positions(document: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _beyond(width: float, noise: float, expanded: float | None, known: float, kind: str) -> str:
-    """What a width has beyond that of noise, in quadrature, as normal deviations add up; U: the width's, carried on."""
-    feature = "board" if kind == "flat" else "sphere"
-    own = (
-        f"a perfect {feature} has {rounded(noise, min(places_of(known if expanded is None else expanded), 4))} by noise"
-    )
-    beyond = math.sqrt(max(width**2 - noise**2, 0.0))
-    if beyond > 0:
-        slope = width / beyond
-        unsure = None if expanded is None else slope * expanded
-        return f"{own}, beyond it {with_uncertainty(beyond, unsure, slope * known)}"
-    if expanded is None:
-        return f"{own}, nothing beyond it (+- unknown)"
-    most = math.sqrt(max((width + expanded) ** 2 - noise**2, 0.0))
-    return f"{own}, nothing beyond it ({f'{alone(most)} at most' if most > 0 else 'nor within U'})"
+def _beyond(found: dict[str, Any], known: float) -> str:
+    """What a width has beyond that of noise: a figure only where its U leaves something of it, else a limit."""
+    if found["least_mm"] is None:
+        return (
+            f"beyond it {with_uncertainty(found['mm'], None, known)}"
+            if found["mm"] > 0
+            else "nothing beyond it is sure"
+        )
+    if found["least_mm"] > 0:
+        return f"beyond it {with_uncertainty(found['mm'], found['mm'] - found['least_mm'])}"
+    return f"beyond it {alone(found['most_mm'])} at most"
 
 
 def _known(one: dict[str, Any], kind: str, name: str) -> float:
@@ -203,16 +201,16 @@ def _of_repeats(found: dict[str, Any] | None) -> list[tuple[str, str]]:
 def _of_systematic(besides: dict[str, Any] | None) -> str:
     """What is in none of a scan's uncertainties, in words: what is unknown is no zero."""
     if besides is None:
-        return "not told, in none of these figures"
+        return "not told, in none of the measured figures"
     whole = "" if besides["calibration"] else " besides the calibration"
     unknown = ", ".join(besides["unknown"])
     if not besides["mm"] > 0:
         said = f"unknown ({unknown})" if unknown else "none is known of"
-        return f"{said}{whole}; in none of these figures"
+        return f"{said}{whole}; in none of the measured figures"
     known = f"{alone(2 * besides['mm'])} mm of depth (k = 2){whole}"
     if unknown:
-        return f"at least +-{known}, and what is unknown ({unknown}); in none of these figures"
-    return f"+-{known}, in none of these figures"
+        return f"at least +-{known}, and what is unknown ({unknown}); in none of the measured figures"
+    return f"+-{known}, in none of the measured figures"
 
 
 def _of_uncertainty(one: dict[str, Any]) -> str:

@@ -194,9 +194,11 @@ def of_a_board(**more: Any) -> dict[str, Any]:
     figures = {"flatness_mm": 0.39004, "rms_mm": 0.06391, "distance_mm": 1346.00011, "used": 0.52, "noise_mm": 0.3}
     names = ("flatness_mm", "rms_mm", "distance_mm")
     spreads = {name: {"random": 0.002, "calibration": None, "expanded": None} for name in names}
+    spreads["noise_mm"] = {"random": 0.002, "calibration": 0.003, "expanded": 0.0072}
+    beyond = {"flatness_mm": {"mm": 0.249, "least_mm": None, "most_mm": None}}
     one = {
         "scan": "b1",
-        "flat": {**figures, "uncertainty": spreads},
+        "flat": {**figures, "uncertainty": spreads, "beyond": beyond},
         "coverage_factor": 2.0,
         "unknown": "no covariance",
         "systematic_besides": {"mm": 0.0, "calibration": True, "unknown": ["calibration", "response"]},
@@ -209,22 +211,21 @@ def test_what_is_unknown_is_no_zero_and_has_no_digits(capsys: pytest.CaptureFixt
     worst = max(errors_of(found), key=lambda error: error.mm)
     show(found, worst)
     said = " ".join(capsys.readouterr().out.split())
-    assert "systematic unknown (calibration, response); in none of these figures: b1" in said
-    assert "0.390 +- unknown 0.064 +- unknown 1346.000 +- unknown 0.5200 0.300" in said
-    assert "has 0.300 by noise, beyond it 0.249 +- unknown: b1" in said
+    assert "systematic unknown (calibration, response); in none of the measured figures: b1" in said
+    assert "0.390 +- unknown 0.064 +- unknown 1346.000 +- unknown 0.5200 0.3000 +- 0.0072" in said
+    assert "has 0.3000 +- 0.0072 by noise, beyond it 0.249 +- unknown: b1" in said
     assert "largest error 0.390 +- unknown mm, the flatness of b1, as measured" in said
     besides = {"mm": 0.0163, "calibration": True, "unknown": ["calibration"]}
     show(of_a_board(systematic_besides=besides), worst)
     said = " ".join(capsys.readouterr().out.split())
     assert "systematic at least +-0.033 mm of depth (k = 2), and what is unknown (calibration); in none of" in said
-    known = of_a_board()
-    known["scans"][0]["flat"]["uncertainty"]["flatness_mm"]["expanded"] = 0.02
-    show(known, worst)
-    assert (
-        "0.390 +- 0.020 mm, VDI/VDE 2634-2, 99.7 % of the points; a perfect board has 0.300 by noise, beyond it "
-        in (shown := " ".join(capsys.readouterr().out.split()))
-    )
-    assert "beyond it 0.249 +- 0.031: b1" in shown, "of 0.39 +- 0.02 in quadrature"
+    for least, words in ((0.2184, "beyond it 0.249 +- 0.031: b1"), (0.0, "beyond it 0.28 at most: b1")):
+        known = of_a_board()
+        known["scans"][0]["flat"]["uncertainty"]["flatness_mm"]["expanded"] = 0.02
+        known["scans"][0]["flat"]["beyond"]["flatness_mm"] |= {"least_mm": least, "most_mm": 0.277}
+        show(known, worst)
+        of = "0.390 +- 0.020 mm, VDI/VDE 2634-2, 99.7 % of the points; a perfect board has 0.3000 +- 0.0072 by noise, "
+        assert of + words in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_board_of_half_a_scans_points_is_warned_of(tmp_path: Path) -> None:
@@ -313,7 +314,7 @@ def test_verify_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     ball_folder = str(save(tmp_path / "ball", ball(noise_mm=0.01)))
     assert main(["calibrate", "verify", ball_folder, "--sphere", "50", "--tolerance", "0.2"]) == 0
     shown = capsys.readouterr()
-    assert "not told, in none of these figures" in " ".join(shown.out.split())
+    assert "not told, in none of the measured figures" in " ".join(shown.out.split())
     assert "+- unknown" in shown.out
     assert "99.7 % of the points; what noise makes of it is not known" in " ".join(shown.out.split())
     assert "whether it is with its uncertainty is not known" in shown.err
@@ -321,7 +322,7 @@ def test_verify_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     (tmp_path / "ball" / "report.json").write_text(json.dumps(budget))
     assert main(["calibrate", "verify", ball_folder, "--sphere", "50", "--tolerance", "0.2"]) == 0
     shown = capsys.readouterr()
-    assert "+-0.58 mm of depth (k = 2), in none of these figures" in " ".join(shown.out.split())
+    assert "+-0.58 mm of depth (k = 2), in none of the measured figures" in " ".join(shown.out.split())
     albedo, xyz = scanned_target()
     row = str(save(tmp_path / "target", xyz, albedo.astype(np.float32)))
     capsys.readouterr()
