@@ -1,7 +1,7 @@
 """One scan verified: every feature that is asked for, measured, and how sure its figures are. Plain data comes out.
 
-The scan's calibration is the one that its capture keeps, if it has the name that the report has and its points are
-those of the scan; another one would give uncertainties of another rig.
+The scan's calibration is the one that lies beside it (decoded) or in its capture (scanned), if it has the name that the
+report has and its points are those of the scan; another one would give uncertainties of another rig.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
     """The figures of one scan, by kind, each with its uncertainties; and what these leave out.
 
     Args:
-        folder: of the scan. given: a calibration file to take in place of its capture's.
+        folder: of the scan. given: a calibration file to take in place of the one kept.
 
     Raises:
         DecodeError: the scan has no points, or none of a feature; the edge lies beyond the picture.
@@ -167,14 +167,14 @@ def rig_of(folder: Path, scan: Scan, given: Path | None = None) -> tuple[Rig | N
 
 
 def _kept(folder: Path, scan: Scan) -> Calibration | None:
-    """The calibration that the scan's capture names, in the scan's folder or around it."""
+    """The calibration that lies beside the scan, or that its capture names, in the scan's folder or around it."""
     name = (scan.report.get("rig") or {}).get("calibration")
-    for place in (folder / "capture", folder.resolve().parent):
+    for place in (None, folder / "capture", folder.resolve().parent):
         try:
-            path = Capture.open(place).calibration_path
+            path = folder / "calibration.json" if place is None else Capture.open(place).calibration_path
             found = None if path is None else load_calibration(path)
         except ScannerError:
-            continue  # no capture, or another one: there is nothing to know of it
+            continue  # none there, or another capture: there is nothing to know of it
         if found is not None and found.id == name:
             return found
     return None

@@ -54,7 +54,7 @@ def verify(
     ] = None,
     calibration: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Calibration that made the scans. Default: the one their captures keep."),
+        typer.Option(metavar="FILE", help="Calibration that made the scans. Default: the one kept with them."),
     ] = None,
     as_json: AsJson = False,
 ) -> int:

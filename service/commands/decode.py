@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,6 +23,9 @@ from service.commands.options import (
 )
 from service.commands.summary import report_result
 from service.terminal import print_error, progress_lines
+
+if TYPE_CHECKING:
+    from scanner.geometry import Calibration
 
 
 def decode(
@@ -107,6 +110,7 @@ def decode(
             if lost is not None:
                 made = made.with_report(warnings=[lost, *made.report["warnings"]])
             lines.stage("writing files")
+            _keep_calibration(lens_file, folder, opened.path)
             made.save(folder)
         except BaseException:
             if lost is not None:
@@ -123,3 +127,11 @@ def decode(
         print_error("no calibration: values are decoded, but no points", "--calibration FILE", label="warning")
     report_result(folder, time.monotonic() - began, lines.spent, as_json=as_json)
     return 0
+
+
+def _keep_calibration(calibration: Calibration | None, folder: Path, capture: Path) -> None:
+    """Store what the points are made with beside them, as a capture does; its own file stays as it is."""
+    from scanner.storage import replace_json  # noqa: PLC0415
+
+    if calibration is not None and folder.resolve() != capture.resolve():
+        replace_json(folder / "calibration.json", calibration.as_dict())

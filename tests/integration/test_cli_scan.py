@@ -92,6 +92,14 @@ def test_a_scan_from_nothing_to_files_and_again(tmp_path: Path, here: Here) -> N
     assert Capture.open(folder / "capture").header.id != capture.header.id
     # What was captured decodes again, to the same rows.
     assert here("decode", folder / "capture", "-o", tmp_path / "again")[0] == 0
+    # Decoded with another calibration, a scan keeps that one.
+    other = json.loads((folder / "capture" / "calibration.json").read_text()) | {"id": "another"}
+    (tmp_path / "other.json").write_text(json.dumps(other))
+    of_other = tmp_path / "of_other"
+    assert here("decode", folder / "capture", "--calibration", tmp_path / "other.json", "-o", of_other)[0] == 0
+    said = here("calibrate", "verify", of_other, "--flat")[1]
+    assert "the calibration has no covariance" in said
+    assert json.loads((of_other / "calibration.json").read_text())["id"] == "another"
     np.testing.assert_array_equal(load_scan(tmp_path / "again").rows, load_scan(folder).rows)
     status, out, err = here("audit", folder / "capture", "-o", tmp_path / "timing.svg", "--json")
     assert status == 0, err

@@ -323,6 +323,12 @@ def test_verify_takes_the_calibration_that_made_the_scan_and_no_other(tmp_path, 
     # U contains the calibration: only the others are said to be in none of the figures.
     assert "at least +-0.032 mm of depth (k = 2) besides the calibration, and what is unknown (sync); in none" in said
     save(tmp_path / "b", *ball(), "another")
+    # What `fringed decode --calibration` leaves beside a scan is its calibration, whatever its capture keeps.
+    beside = tmp_path / "b" / "calibration.json"
+    beside.write_text(json.dumps(rig(id="another")))
+    assert main(["calibrate", "verify", str(tmp_path / "b"), "--sphere", "119.5"]) == 0
+    assert "expanded uncertainty, k = 2: the calibration's covariance" in capsys.readouterr().out
+    beside.unlink()
     without, other, true = (tmp_path / f"{name}.json" for name in ("without", "other", "true"))
     without.write_text(json.dumps(rig(covariance=None)))
     true.write_text(json.dumps(rig(covariance=None, id="simulated-casey2011")))
