@@ -72,7 +72,7 @@ def verify(
       fringed calibrate verify ball1 ball2 ball3 --sphere 50.012
       fringed calibrate verify target/ --target charuco:10x7:30 --length 240.05
       fringed calibrate verify board1 board2 board3 --flat --repeat --json
-      fringed calibrate verify block/ --edge 600,300,60,200
+      fringed calibrate verify block/ --edge 1230,60,60,200
       fringed calibrate verify today/ --marks marks.json
     """
     if length is not None and target is None:
