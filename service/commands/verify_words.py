@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -175,15 +176,40 @@ def show(document: dict[str, Any], worst: Error | None) -> None:
     facts += _of_repeats(document.get("repeatability"))
     if worst is not None:
         facts.append(("largest error", f"{worst.words}, as measured"))
-    for one in document["scans"]:
-        if "coverage_factor" in one:
-            facts.append(("+-", f"{_of_uncertainty(one)}: {one['scan']}"))
-        facts.append(("systematic", f"{_of_systematic(one['systematic_besides'])}: {one['scan']}"))
+    scans, one_scene = document["scans"], document.get("repeatability") is not None
+    sure = [(_of_uncertainty(one), _points_part(one), one["scan"]) for one in scans if "coverage_factor" in one]
+    besides = [one["systematic_besides"] for one in scans]
+    facts += _once("+-", sure, one_scene)
+    of = [(_of_systematic(b), b["mm"] if b else 0.0, one["scan"]) for b, one in zip(besides, scans, strict=True)]
+    facts += _once("systematic", of, one_scene)
     print_facts("verification", [*facts, *_of_positions(document)])
     # Of the scan whose figure it dominates most: twenty notes say no more than one.
     stated = [one["stated_length"] for one in document["scans"] if one.get("stated_length") is not None]
     if (hint := dominates(max(stated, key=lambda found: float(found["share"]), default=None))) is not None:
         print_error(hint, label="note")
+
+
+def _once(label: str, said: list[tuple[str, float, str]], one_scene: bool) -> list[tuple[str, str]]:
+    """Lines of what is said of scans: what is said of several alike is one line.
+
+    Args:
+        said: words, how much they say, and of which scan. one_scene: words that differ in digits alone are alike, too,
+            and those that say most stand for all.
+    """
+    of: dict[str, list[tuple[float, str, str]]] = {}
+    for words, much, scan in said:
+        of.setdefault(re.sub(r"\d", "#", words) if one_scene else words, []).append((much, words, scan))
+    lines = []
+    for alike in of.values():
+        which = (
+            alike[0][2]
+            if len(alike) == 1
+            else "all scans"
+            if len(alike) == len(said)
+            else ", ".join(s for *_, s in alike)
+        )
+        lines.append((label, f"{max(alike)[1]}: {which}{', at most' if len({w for _, w, _ in alike}) > 1 else ''}"))
+    return lines
 
 
 def _of_repeats(found: dict[str, Any] | None) -> list[tuple[str, str]]:
@@ -217,11 +243,15 @@ def _of_uncertainty(one: dict[str, Any]) -> str:
     """What the uncertainties of a scan's figures contain, and why they are unknown where they are."""
     if one["unknown"] is None:
         return "expanded uncertainty, k = 2: the calibration's covariance, and the points"
+    return f"unknown, {one['unknown']}; the points' own part, k = 2, is up to {alone(2 * _points_part(one))} mm"
+
+
+def _points_part(one: dict[str, Any]) -> float:
+    """The largest 1-sigma, mm, that points leave of a scan's figures."""
     parts = [one[kind]["uncertainty"] for kind in ("flat", "sphere", "length") if kind in one]
-    largest = max(
-        (s["random"] for part in parts for n, s in part.items() if n.endswith("_mm") and s["random"]), default=0
+    return max(
+        (s["random"] for part in parts for n, s in part.items() if n.endswith("_mm") and s["random"]), default=0.0
     )
-    return f"unknown, {one['unknown']}; the points' own part, k = 2, is up to {alone(2 * largest)} mm"
 
 
 def _cells_of(kind: str, one: dict[str, Any]) -> dict[str, Any]:

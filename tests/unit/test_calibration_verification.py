@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -226,6 +227,27 @@ def test_what_is_unknown_is_no_zero_and_has_no_digits(capsys: pytest.CaptureFixt
         show(known, worst)
         of = "0.390 +- 0.020 mm, VDI/VDE 2634-2, 99.7 % of the points; a perfect board has 0.3000 +- 0.0072 by noise, "
         assert of + words in " ".join(capsys.readouterr().out.split())
+
+
+def test_what_is_said_of_all_scans_is_said_once(capsys: pytest.CaptureFixture[str]) -> None:
+    ones = [of_a_board(scan=name)["scans"][0] for name in ("b1", "b2", "b3")]
+    for one, mm in zip(ones, (0.016, 0.021, 0.017), strict=True):
+        one["systematic_besides"] = {"mm": mm, "calibration": True, "unknown": ["calibration"]}
+    repeats = {
+        "depth_mm": 0.1,
+        "drift_mm": 0.0,
+        "scans": 3,
+        "points": 9,
+        "uncertainty": {"depth_mm": {"expanded": 0.1}},
+    }
+    for repeated, lines in ((None, 3), (repeats, 1)):
+        show({"scans": ones, "repeatability": repeated}, None)
+        said = capsys.readouterr().out
+        assert len(re.findall(r"^\+-", said, re.M)) == 1
+        assert len(re.findall(r"^systematic", said, re.M)) == lines
+        assert "up to 0.0040 mm: all scans" in said
+    assert "at least +-0.042 mm of depth (k = 2), and what is unknown (calibration)" in said
+    assert ": all scans, at most" in said
 
 
 def test_a_board_of_half_a_scans_points_is_warned_of(tmp_path: Path) -> None:
