@@ -211,7 +211,10 @@ def test_what_is_unknown_is_no_zero_and_has_no_digits(capsys: pytest.CaptureFixt
     found = of_a_board()
     worst = max(errors_of(found), key=lambda error: error.mm)
     show(found, worst)
-    said = " ".join(capsys.readouterr().out.split())
+    shown = capsys.readouterr()
+    assert "note: for uncertainties a calibration needs a covariance, which fringed calibrate solve" in shown.err
+    said = " ".join(shown.out.split())
+    assert "noise of normal errors 99.7 % of the points span 5.9 sigmas" in said
     assert "systematic unknown (calibration, response); in none of the measured figures: b1" in said
     assert "0.390 +- unknown 0.064 +- unknown 1346.000 +- unknown 0.5200 0.3000 +- 0.0072" in said
     assert "has 0.3000 +- 0.0072 by noise, beyond it 0.249 +- unknown: b1" in said

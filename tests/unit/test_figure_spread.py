@@ -312,6 +312,7 @@ def test_verify_takes_the_calibration_that_made_the_scan_and_no_other(tmp_path, 
     report.write_text(json.dumps({**json.loads(report.read_text()), "uncertainty": budget}))
     assert main(ask) == 0
     said, noted = capsys.readouterr()
+    assert "needs a covariance" not in noted
     assert "note: the stated length 100.00 +- 0.20 mm (k = 2) dominates, with " in noted
     assert re.search(r"\b0\.\d\d \+- 0\.2\d\b", said), "value and U end at one place"
     assert re.search(
