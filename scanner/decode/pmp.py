@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -85,7 +86,7 @@ class PmpDecoder:
         self._maps = {axis: AxisMaps.empty(camera.width * camera.height) for axis in self._pattern.axes}
         self._found: dict[Axis, AxisFound] = {}
         self._ends: dict[Axis, FieldEnd | None] = {}
-        self._doubled: list[str] = []
+        self._doubled: dict[Axis, list[str]] = {axis: [] for axis in self._pattern.axes}
 
     @property
     def camera(self) -> CameraFormat:
@@ -136,7 +137,7 @@ class PmpDecoder:
                 warnings += (ripple,)
             warnings += self._told_of_counts(axis, found)
         warnings += self._found[self._pattern.axes[0]].ladder.warnings()
-        return self._decoded((*self._doubled, *warnings))
+        return self._decoded((*chain(*self._doubled.values()), *warnings))
 
     def coordinates(self) -> Coordinates:
         """In place of `finish`: the same coordinates and confidence, in less time.
@@ -156,7 +157,7 @@ class PmpDecoder:
         shape = self._camera.shape
         position, confidence = found.maps.position.reshape(shape), found.maps.confidence.reshape(shape)
         rows, columns = (position, None) if axis == "y" else (None, position)
-        warnings = (*self._doubled, *warnings, *self._told_of_counts(axis, found), *found.ladder.warnings())
+        warnings = (*self._doubled[axis], *warnings, *self._told_of_counts(axis, found), *found.ladder.warnings())
         return Coordinates(rows, columns, confidence, warnings)
 
     def _took(self, fringe: int, frame: NDArray[Any]) -> None:
@@ -193,7 +194,7 @@ class PmpDecoder:
 
     def _decoded_in_step(self, axis: Axis, brief: bool) -> AxisFound:
         """Decode one axis, without the frames of it that are found to show what they should not."""
-        found, known = self._decoded_axis(axis, brief), len(self._doubled)
+        found, known = self._decoded_axis(axis, brief), len(self._doubled[axis])
         for look in (self._all_late, self._misplaced, *[self._disordered] * len(self._pattern.frequencies)):
             mended = look(axis, found) if found.may_be_doubled else None
             if mended is not None:
@@ -202,13 +203,13 @@ class PmpDecoder:
                 found = self._decoded_axis(axis, brief)
         frequencies, shifts = self._pattern.frequencies, self._pattern.shifts
         if found.may_be_doubled and (drift := self._drift(axis, found)):
-            self._doubled.append(moved(axis, drift))
+            self._doubled[axis].append(moved(axis, drift))
             return self._without_values(axis, found, brief, Reason.MOVED)
         if rotated := rotated_sets(found.ladder, found.remainders, shifts):
-            self._doubled += out_of_step(axis, rotated, frequencies, shifts)
+            self._doubled[axis] += out_of_step(axis, rotated, frequencies, shifts)
             return self._without_values(axis, found, brief)
-        if len(self._doubled) > known and (more := still_apart(axis, found.remainders)):
-            self._doubled += more
+        if len(self._doubled[axis]) > known and (more := still_apart(axis, found.remainders)):
+            self._doubled[axis] += more
             return self._without_values(axis, found, brief)
         return found
 
@@ -243,7 +244,9 @@ class PmpDecoder:
         ]
         for fault in faults:
             told = fault.says(lambda k, n: self._sequence.fringes[sets[k].first + n])
-            self._doubled.append(f"frequency {sets[fault.of_set].frequency:g} along {axis}: {told}; capture again")
+            self._doubled[axis].append(
+                f"frequency {sets[fault.of_set].frequency:g} along {axis}: {told}; capture again"
+            )
             fault.mend(self._frames, sets[fault.of_set].first)
         return all(fault.mended for fault in faults) if faults else None
 
@@ -263,7 +266,7 @@ class PmpDecoder:
         if mended:
             exchange(self._frames, *(sets[k].first + n for k, n in these[0].exchanged))
         told = told_of(these, mended, axis, self._pattern, lambda k, n: self._sequence.fringes[sets[k].first + n])
-        self._doubled.append(f"{told}; capture again")
+        self._doubled[axis].append(f"{told}; capture again")
         return mended
 
     def _decoded_axis(self, axis: Axis, brief: bool) -> AxisFound:
