@@ -194,7 +194,7 @@ class PmpDecoder:
 
     def _decoded_in_step(self, axis: Axis, brief: bool) -> AxisFound:
         """Decode one axis, without the frames of it that are found to show what they should not."""
-        found, known = self._decoded_axis(axis, brief), len(self._doubled[axis])
+        found = self._decoded_axis(axis, brief)
         for look in (self._all_late, self._misplaced, *[self._disordered] * len(self._pattern.frequencies)):
             mended = look(axis, found) if found.may_be_doubled else None
             if mended is not None:
@@ -208,7 +208,7 @@ class PmpDecoder:
         if rotated := rotated_sets(found.ladder, found.remainders, shifts):
             self._doubled[axis] += out_of_step(axis, rotated, frequencies, shifts)
             return self._without_values(axis, found, brief)
-        if len(self._doubled[axis]) > known and (more := still_apart(axis, found.remainders)):
+        if self._doubled[axis] and (more := still_apart(axis, found.remainders)):
             self._doubled[axis] += more
             return self._without_values(axis, found, brief)
         return found
