@@ -14,7 +14,7 @@ poses), and tilted by 30 degrees both ways, by PMP and by MCP: flatness (worst o
 plane), shape (rms after a rigid fit of a whole board to truth), position (rms against truth); inside, 7 px from edges.
 `sphere`: such rigs measure the ball before the board, by (1, 8, 64) x 8 or --shifts: radius less the true one; form as
 rms of the radial distances, as the thinnest shell that holds 95 of 100 (ISO 10360-8, dispersion), as the spread of
-997 of 1000 of them (PF of VDI/VDE 2634-2), and that of a perfect ball whose noise is the stated sigmas.
+997 of 1000 of them (PF of VDI/VDE 2634-2), and that of a perfect ball with what near points differ by.
 `wedge`: the dissertation's own procedure, the wedge with 18 discs and the Hall model, then the board in rows: rms in
 depth in the wedge's frame, with and without the discs' correction for perspective.
 """
