@@ -132,14 +132,17 @@ def middle_of_squares(squares: NDArray[np.float32]) -> np.float32:
 
 @kernel
 def order_of(keys: NDArray[np.float32]) -> NDArray[np.int32]:
-    """(n,) int32: which come first. keys: (n,) float32, 0 or more, without NaN.
+    """(n,) int32: which come first. keys: (n,) float32 without NaN; below 0 they count as 0.
 
     Equal ones keep their order, and so do those that differ by no more than what _DIGITS leave of the octaves between
     the least and the greatest: a thousandth of themselves over an octave and a half, a percent at the very most, since
     what lies more than _OCTAVES below the greatest counts as least. One round of sorting does then, and medians of bins
     of some hundred pixels are no better than that.
     """
-    words, size = keys.view(np.uint32), keys.size
+    bits, size = keys.view(np.uint32), keys.size
+    words = np.empty(size, np.uint32)
+    for i in range(size):
+        words[i] = bits[i] if bits[i] < _SIGN else np.uint32(0)
     low, high = words[0], words[0]
     for i in range(size):
         low, high = min(low, words[i]), max(high, words[i])

@@ -45,10 +45,10 @@ def test_an_order_of_numbers_near_each_other_is_good_to_a_thousandth():
 
 def test_one_that_lies_far_out_leaves_the_others_their_order():
     keys = np.random.default_rng(2).uniform(100, 110, 5000).astype(np.float32)
-    keys[7], keys[4000], keys[3] = 0.0, 1e8, 0.0
+    keys[7], keys[4000], keys[3], keys[9] = 0.0, 1e8, -20.0, -0.0
     order = order_of(keys)
-    assert list(order[[0, 1, -1]]) == [3, 7, 4000]
-    assert np.allclose(keys[order], np.sort(keys), rtol=0.011, atol=0)
+    assert list(order[[0, 1, 2, -1]]) == [3, 7, 9, 4000]
+    assert np.allclose(keys[order[3:]], np.sort(keys)[3:], rtol=0.011, atol=0)
 
 
 @pytest.mark.parametrize("size", [100, 4099])
