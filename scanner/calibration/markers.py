@@ -35,6 +35,6 @@ def of_another_kind(image: NDArray[Any], target: Target) -> str | None:
         return None
     named = f"charuco:{target.columns + 1}x{target.rows + 1}:{target.spacing_mm:g}"
     return (
-        f"{count} ArUco markers are in the scan, and a chessboard has none: this is a ChArUco board, whose markers "
+        f"{count} ArUco markers are in the picture, and a chessboard has none: this is a ChArUco board, whose markers "
         f"disturb corners that are measured as a chessboard's. Describe it as it was printed: {named}[:MARKER[:DICT]]"
     )

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from scanner.calibration.copies import again, capture_key
 from scanner.calibration.detection import FEWEST_POINTS, NotFound, detect
+from scanner.calibration.markers import of_another_kind
 from scanner.calibration.problem import View
 from scanner.calibration.projector_points import projector_points
 from scanner.calibration.targets import Target
@@ -90,11 +91,13 @@ def observe(
     paths: Sequence[Path], target: Target, progress: Callable[[int, int], None] | None = None
 ) -> tuple[list[Observation], list[LeftOut]]:
     """Look at every capture; see `observe_capture`. Copies of one that serves are left out. progress: (done, total)."""
-    observations, left_out = [], []
+    observations: list[Observation] = []
+    left_out: list[LeftOut] = []
     names = _names(paths)
     seen: dict[Hashable, tuple[Path, str]] = {}
     for done, (path, name) in enumerate(zip(paths, names, strict=True)):
-        outcome = observe_capture(path, name, target)
+        # All show the same target, and a look for markers takes as long as all else.
+        outcome = observe_capture(path, name, target, doubt_kind=not observations)
         if isinstance(outcome, Observation) and (how := again(path, (outcome.key,), seen)) is not None:
             outcome = LeftOut(name, f"it {how}, and tells nothing new")
         if isinstance(outcome, Observation):
@@ -117,8 +120,8 @@ def warm_up_of(observations: Sequence[Observation]) -> dict[str, list[float]]:
     return found
 
 
-def observe_capture(path: Path, name: str, target: Target) -> Observation | LeftOut:
-    """Decode one capture and find the target in it."""
+def observe_capture(path: Path, name: str, target: Target, *, doubt_kind: bool = False) -> Observation | LeftOut:
+    """Decode one capture and find the target in it. doubt_kind: warn of one that is of another kind than described."""
     try:
         capture = Capture.open(path)
         sequence = capture.header.sequence
@@ -146,6 +149,7 @@ def observe_capture(path: Path, name: str, target: Target) -> Observation | Left
     if isinstance(view, LeftOut):
         return view
     camera, projector = capture.header.camera, sequence.projector
+    other_kind = of_another_kind(decoded.albedo, target) if doubt_kind else None
     correction = sequence.precorrection
     return Observation(
         view,
@@ -155,7 +159,7 @@ def observe_capture(path: Path, name: str, target: Target) -> Observation | Left
         capture.header.created,
         capture.header.extra.get("warm_up") or {},
         key,
-        (*filter(None, [capture.lost]), *decoded.warnings),
+        (*filter(None, [other_kind, capture.lost]), *decoded.warnings),
     )
 
 

@@ -38,6 +38,10 @@ SHALLOW = 0.03
 """Range of depth over mean depth below which it is named as the likely cause."""
 FLAT_TILT_DEG = 5.0
 
+OBLONG = 0.05
+"""By which pixels are not square that are worth a word: industrial cameras are square to .001, casey2011's projector to
+.012. More is a picture that was scaled on its way, or whose size is stated wrong."""
+
 MISMATCH = (
     "check that the target's columns and rows are stated right, that it lay still during each capture, and that "
     "nothing on the rig moved between captures"
@@ -189,6 +193,22 @@ def check_stated(problem: Problem, state: State, baseline_mm: float | None, dist
             )
         if abs(ratio - 1) > WARN_STATED_OFF:
             warnings.append(f"the {what} comes out as {found:.1f} mm, {stated:.1f} mm were entered ({ratio - 1:+.1%})")
+    return warnings
+
+
+def oblong_pixels(problem: Problem, state: State) -> list[str]:
+    """Warnings of sides whose pixels come out far from square."""
+    warnings = []
+    for side, lens, size in (
+        ("camera", state.camera, problem.camera_size),
+        ("projector", state.projector, problem.projector_size),
+    ):
+        aspect = float(lens.matrix[0, 0] / lens.matrix[1, 1])
+        if abs(np.log(aspect)) > np.log1p(OBLONG):
+            warnings.append(
+                f"the {side}'s pixels come out {aspect:.2f} times as high as wide: unless it is made so, as diamond "
+                f"arrays are, its picture is not {size[0]} x {size[1]} px, or is scaled on its way"
+            )
     return warnings
 
 

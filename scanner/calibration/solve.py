@@ -27,6 +27,7 @@ from scanner.calibration.plausibility import (
     check_motion,
     check_state,
     check_stated,
+    oblong_pixels,
 )
 from scanner.calibration.problem import (
     CAMERA,
@@ -263,6 +264,7 @@ def _warnings(solution: Solution) -> list[str]:
                 f"the poses cover {span[0]:.0%} x {span[1]:.0%} of the {side}'s picture: "
                 "what lies outside is extrapolated"
             )
+    warnings += oblong_pixels(problem, adjusted.state)
     if lacking := not_met(problem, adjusted.state):
         warnings.append(lacking)
     dropped = sum(int((~k).sum()) for k in adjusted.kept)

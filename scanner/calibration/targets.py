@@ -30,6 +30,11 @@ FORMS = (
     "acircles:COLUMNSxROWS:SPACING[:DIAMETER] (mm)",
     "wedge:FILE (discs in space)",
 )
+DISCS_FILE = (
+    'a target in space is a file {"format": "fringed-target", "version": 1, "diameter_mm": 28, "points": [[x, y, z], '
+    '...], "normals": [[x, y, z], ...]}, mm; without normals the discs\' centres take no correction for perspective'
+)
+"""What to say to who has none."""
 MOST_POINTS_A_SIDE = 200
 MARKER_SHARE = 0.75
 """Side of a marker over that of its square, where none is said: a module is then an eighth of a square."""
@@ -123,7 +128,7 @@ def load_discs(path: Path) -> Target:
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"target {path} is not JSON: {error}") from error
     if not isinstance(content, dict) or content.get("format") != "fringed-target" or content.get("version") != 1:
-        raise ConfigError(f"target {path} is no fringed-target file of version 1", hint=load_discs.__doc__)
+        raise ConfigError(f"target {path} is no fringed-target file of version 1", hint=DISCS_FILE)
     points = _vectors(content.get("points"), f"target {path}: points")
     if len(points) < FEWEST_DISCS:
         raise ConfigError(f"target {path} has {len(points)} points, a target in space needs {FEWEST_DISCS}")

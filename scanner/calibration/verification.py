@@ -41,6 +41,8 @@ OTHER_SAMPLE = 4000
 """Points of a scan that are asked for it"""
 OUTLINE = 0.9
 """Of a ball's radius: rays that pass it nearer than that see nothing else, however blurred its edge is."""
+SAME_SIZE = 0.02
+"""Of the diameter: as much as the best sphere through a hundred points is off"""
 ROUND_SHARE = 0.02
 """Of its diameter, rms: what fits a sphere worse is something else that is round, as a head (4 to 7 %)"""
 
@@ -352,6 +354,12 @@ def _no_sphere(points: Array, on_best: int, diameter_mm: float | None) -> Decode
         centre, radius = sphere_through(few[used])
         rms = float(np.sqrt(np.mean((np.linalg.norm(few[used] - centre, axis=1) - radius) ** 2)))
         if rms < ROUND_SHARE * 2 * radius:
+            if abs(2 * radius / diameter_mm - 1) < SAME_SIZE:
+                return DecodeError(
+                    f"{on_best} points of the sphere of {diameter_mm:g} mm are too few to measure it by, "
+                    f"{FEWEST_POINTS} are needed",
+                    hint=NO_POINTS,
+                )
             doubled = abs(radius / diameter_mm - 1) < 0.1
             return DecodeError(
                 f"no sphere of {diameter_mm:g} mm diameter among the points; there is one of {2 * radius:.2f} mm "

@@ -315,3 +315,14 @@ def test_command_draws_a_target(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "warning" not in capsys.readouterr().err
     assert main(["calibrate", "target", "chessboard:9x6:30", "-o", str(tmp_path / "board.pdf")]) == 2
     assert main(["calibrate", "target", "chessboard:9x6:30", "-o", str(file)]) == 2
+
+
+def test_a_charuco_board_that_is_described_as_a_chessboard_is_warned_of_once(tmp_path: Path) -> None:
+    for k in (0, 4):
+        write_capture(tmp_path / str(k) / "capture", f"quick/charuco_poses?pose={k}&seed=2")
+    captures = [tmp_path / str(k) / "capture" for k in (0, 4)]
+    for described, warned in (("chessboard:9x6:19", 1), ("charuco:10x7:19", 0)):
+        found, _ = observe(captures, parse_target(described))
+        assert found
+        said = [one for one in warnings_of(found) if "this is a ChArUco board" in one]
+        assert len(said) == warned

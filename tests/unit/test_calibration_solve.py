@@ -287,6 +287,16 @@ def test_turned_projectors_are_accepted_and_named(degrees: int) -> None:
     assert np.linalg.norm(found.state.translation) == pytest.approx(np.linalg.norm(RIG.translation), abs=0.3)
 
 
+def test_a_picture_that_is_scaled_on_its_way_is_named(solution: Solution) -> None:
+    assert not any("as high as wide" in said for said in solution.warnings)
+    wide = 4 * RIG.projector.size[0] // 3
+    seen = _projector_seen(RIG, lambda p, w, h: ((p[:, 0] + 0.5) * wide / w - 0.5, p[:, 1]))
+    found = calibrate(TARGET, [replace(one, projector_size=(wide, one.projector_size[1])) for one in seen], LENGTH)
+    (said,) = (said for said in found.warnings if "as high as wide" in said)
+    assert said.startswith("the projector's pixels come out 1.33 times as high as wide")
+    assert f"{wide} x {RIG.projector.size[1]} px" in said
+
+
 def test_mirrored_and_swapped_are_refused_by_name() -> None:
     for change, word, setting in (
         (lambda p, w, h: (w - 1 - p[:, 0], p[:, 1]), "mirrored left to right", "mirror = true under"),

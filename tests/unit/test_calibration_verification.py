@@ -118,6 +118,18 @@ def test_sphere_of_another_size_is_not_found() -> None:
         sphere(board()[::2, ::2], 20.0)
 
 
+def test_a_sphere_of_too_few_points_is_no_sphere_of_another_size() -> None:
+    # A wider wall: the scan has points enough, the ball has not.
+    thin = np.pad(ball(noise_mm=0.03), ((0, 0), (0, 300), (0, 0)), constant_values=np.nan)[::4, ::4]
+    y, x = np.nonzero(np.isnan(thin).all(axis=2))
+    thin[y, x] = np.stack((2.0 * x - 40, 2.0 * y - 30, np.full(x.size, 460.0)), axis=-1)
+    with pytest.raises(
+        DecodeError, match=r"\d+ points of the sphere of 50 mm are too few .* 500 are needed"
+    ) as refused:
+        sphere(thin, 50.0)
+    assert "another" not in str(refused.value)
+
+
 @pytest.mark.parametrize(("given", "hint"), [(25.0, "not its radius"), (40.0, "scale of the calibration")])
 def test_a_sphere_of_another_size_is_named_with_its_own(given: float, hint: str) -> None:
     with pytest.raises(DecodeError, match=rf"no sphere of {given:g} mm.* there is one of 50\.0") as refused:

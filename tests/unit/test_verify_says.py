@@ -81,7 +81,7 @@ def test_a_chessboard_with_markers_is_a_charuco_board(tmp_path: Path) -> None:
     assert markers_in(picture) == 35
     words = of_another_kind(picture, chess)
     assert words is not None
-    assert "35 ArUco markers are in the scan" in words
+    assert "35 ArUco markers are in the picture" in words
     assert "charuco:10x7:30" in words
     assert of_another_kind(picture, board_with) is None
     v, u = np.mgrid[: picture.shape[0], : picture.shape[1]] / 2.0
