@@ -114,9 +114,7 @@ def parse_target(text: str) -> Target:
 
 
 def load_discs(path: Path) -> Target:
-    """Discs in space, from a file {"format": "fringed-target", "version": 1, "diameter_mm": 28,
-    "points": [[x, y, z]...], "normals": [[x, y, z]...]}; without normals the discs' centres take no correction for
-    perspective.
+    """Discs in space, from a file of the form that DISCS_FILE says.
 
     Raises:
         ConfigError: unreadable, or not such a file.

@@ -343,7 +343,8 @@ def _finite(xyz: NDArray[Any]) -> tuple[Array, NDArray[np.intp]]:
 
 
 def _no_sphere(points: Array, on_best: int, diameter_mm: float | None) -> DecodeError:
-    """The error for a sphere that is not there, with the one of another size that is."""
+    """The error for a sphere that is not there, with the one of another size that is. on_best: points on the best one,
+    fewer than are needed; 0 where these are enough, and not round."""
     if diameter_mm is None:
         return DecodeError(f"no sphere among the points: {on_best} lie on the best one")
     few = points[:: -(-len(points) // OTHER_SAMPLE)]
@@ -354,7 +355,7 @@ def _no_sphere(points: Array, on_best: int, diameter_mm: float | None) -> Decode
         centre, radius = sphere_through(few[used])
         rms = float(np.sqrt(np.mean((np.linalg.norm(few[used] - centre, axis=1) - radius) ** 2)))
         if rms < ROUND_SHARE * 2 * radius:
-            if abs(2 * radius / diameter_mm - 1) < SAME_SIZE:
+            if on_best and abs(2 * radius / diameter_mm - 1) < SAME_SIZE:
                 return DecodeError(
                     f"{on_best} points of the sphere of {diameter_mm:g} mm are too few to measure it by, "
                     f"{FEWEST_POINTS} are needed",
