@@ -93,10 +93,15 @@ def adjust(problem: Problem, start: State, rounds: int = ROUNDS) -> Adjusted:
     return Adjusted(state, covariance, camera, projector, kept, *sigmas, cost)
 
 
-def adjust_again(problem: Problem, start: State, sigmas: tuple[float, float]) -> State:
-    """Once more from a start that is nearly right, with sigmas that are known."""
-    solved = Equations(problem, sigmas).minimise(start.vector(), FIRST_TOLERANCE)
-    return State.from_vector(solved, problem)
+def adjust_again(problem: Problem, start: State, sigmas: tuple[float, float]) -> tuple[State, Array]:
+    """Once more from a start that is nearly right, with sigmas that are known; and its covariance as in `Adjusted`.
+
+    Raises:
+        numpy.linalg.LinAlgError, ValueError: the problem is singular.
+    """
+    equations = Equations(problem, sigmas)
+    solved = equations.minimise(start.vector(), FIRST_TOLERANCE)
+    return State.from_vector(solved, problem), equations.covariance(solved)[0]
 
 
 class Equations:

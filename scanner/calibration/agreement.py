@@ -1,8 +1,9 @@
 """Which views agree: the adjustment of those that do, and the others named, with why.
 
 One wrong view among many stands out by its residuals. Among few it bends the whole fit until none does, or until
-there is no rig at all: then rigs of three views are tried, and the one that most views agree with says which do not.
-These are always a minority: three views of six that agree with each other are no better than the three others.
+there is no rig at all, and so do several that are wrong alike: what shows it is by how much the others miss a view that
+was not asked. Then rigs of three views are tried, and the one that most views agree with says which do not. These are
+always a minority: three views of six that agree with each other are no better than the three others.
 """
 
 from __future__ import annotations
@@ -15,18 +16,21 @@ import numpy as np
 
 from scanner.calibration.adjustment import ROUNDS, Adjusted, Array, adjust
 from scanner.calibration.discs import eccentricity
-from scanner.calibration.held_out import prediction
+from scanner.calibration.held_out import HeldOut, hold_out, prediction
 from scanner.calibration.lens_slopes import rotation_of
 from scanner.calibration.observe import LeftOut
 from scanner.calibration.plausibility import MISMATCH
 from scanner.calibration.problem import Problem, State, View, sheet_points
-from scanner.calibration.start import BAD_START_PX, FEWEST_VIEWS, start
+from scanner.calibration.start import FEWEST_VIEWS, start
 from scanner.errors import CalibrationError
 
 BAD_VIEW = 4.0
 """A view whose residual is so many times the median of all views' is bad, and"""
 BAD_VIEW_PX = 0.15
 """more than this: sharp targets differ from pose to pose by their blur alone, within a tenth of a pixel."""
+DOUBTED = 2.0
+"""A view that the others miss by so many times what is typically left has all of them asked who agrees with whom: of
+sound ones, the worst is missed by 1.2 to 1.8 times that."""
 DISC_ROUNDS = 3
 """Of adjustment and the discs' eccentricity in turn."""
 DRAWS = 24
@@ -39,11 +43,18 @@ GROWN = 3
 
 @dataclass(frozen=True, eq=False)
 class Agreed:
-    """problem: with the views that agree; adjusted: theirs; left_out: the others."""
+    """problem: with the views that agree; adjusted: theirs; left_out: the others; held_out: None if not asked."""
 
     problem: Problem
     adjusted: Adjusted
     left_out: tuple[LeftOut, ...] = ()
+    held_out: HeldOut | None = None
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether some views may bend the rig."""
+        held = self.held_out
+        return self.worst_px > BAD_VIEW_PX or (held is not None and held.most_px > DOUBTED * held.typical_px)
 
     @property
     def left_px(self) -> float:
@@ -61,11 +72,12 @@ class Agreed:
         )
 
 
-def agreed(problem: Problem) -> Agreed:
+def agreed(problem: Problem, *, leave_out: bool = True) -> Agreed:
     """Adjust the views that agree.
 
     Args:
         problem: of all views.
+        leave_out: leave each out in turn, too; without it some that bend the rig alike may pass.
 
     Raises:
         CalibrationError: no majority of three or more does.
@@ -74,10 +86,11 @@ def agreed(problem: Problem) -> Agreed:
     failure: CalibrationError | None = None
     try:
         found = _without_bad_views(problem)
+        found = _held_out(found) if leave_out else found
     except CalibrationError as error:
         failure = error
-    if problem.target.flat and (found is None or found.worst_px > BAD_VIEW_PX):
-        found = _searched(problem, found) or found
+    if problem.target.flat and (found is None or found.doubtful):
+        found = _searched(problem, found, leave_out=leave_out) or found
     if found is not None:
         return found
     assert failure is not None  # noqa: S101  nothing was found, so something was raised
@@ -102,20 +115,21 @@ def _without_bad_views(problem: Problem) -> Agreed:
         state = replace(adjusted.state, poses=adjusted.state.poses[keep])
 
 
-def _searched(problem: Problem, whole: Agreed | None) -> Agreed | None:
+def _searched(problem: Problem, whole: Agreed | None, *, leave_out: bool) -> Agreed | None:
     """The largest group that agrees, grown from triples; None where the rest does not contradict it clearly."""
     count = len(problem.views)
     if count <= FEWEST_VIEWS:
         return None
     every = whole if whole is not None and not whole.left_out else _fitted(problem)
-    before = every.left_px if every is not None else np.inf
+    every = _held_out(every) if every is not None and leave_out else every
     ranked = sorted(((_score(problem, triple), triple) for triple in _triples(count)), key=lambda trial: trial[0])
     groups = [_grown(problem, triple) for score, triple in ranked[:GROWN] if np.isfinite(score)]
     found = [
-        (used, fit)
+        (used, _held_out(fit) if leave_out else fit)
         for used, fit in groups
-        if fit is not None and count // 2 < len(used) < count and BAD_VIEW * fit.left_px <= before
+        if fit is not None and count // 2 < len(used) < count
     ]
+    found = [group for group in found if every is None or _clearer(group[1], every)]
     if not found:
         return None
     # A large group that a bad view bends is no better than the small one that it was grown from.
@@ -123,6 +137,24 @@ def _searched(problem: Problem, whole: Agreed | None) -> Agreed | None:
     clean = [group for group in found if group[1].worst_px <= max(BAD_VIEW * least, BAD_VIEW_PX)]
     used, best = max(clean or found, key=lambda group: (len(group[0]), -group[1].left_px))
     return replace(best, left_out=tuple(_contradicting(problem, best, k) for k in range(count) if k not in used))
+
+
+def _clearer(group: Agreed, every: Agreed) -> bool:
+    """Whether the group has a quarter of what is left of every view, or misses its own by a quarter or less."""
+    pairs = [(group.left_px, every.left_px)]
+    if group.held_out is not None and every.held_out is not None:
+        pairs.append((group.held_out.most_px, every.held_out.most_px))
+    return any(BAD_VIEW * less <= more for less, more in pairs)
+
+
+def _held_out(fit: Agreed) -> Agreed:
+    if fit.held_out is not None:
+        return fit
+    try:
+        return replace(fit, held_out=hold_out(fit.problem, fit.adjusted))
+    except (np.linalg.LinAlgError, ValueError):
+        # A rig that one view alone holds together: what it is worth, `check_state` says.
+        return replace(fit, held_out=HeldOut.nothing(fit.adjusted))
 
 
 def _triples(count: int) -> list[tuple[int, ...]]:
@@ -139,7 +171,12 @@ def _score(problem: Problem, triple: Sequence[int]) -> float:
     fit = _fitted(_of(problem, triple), rounds=2)
     if fit is None:
         return float("inf")
-    return float(np.sort(_misses(problem, fit))[len(problem.views) // 2])
+    return _of_majority(_misses(problem, fit))
+
+
+def _of_majority(misses: Array) -> float:
+    """What more than half of the views are missed by, at most."""
+    return float(np.sort(misses)[len(misses) // 2])
 
 
 def _misses(problem: Problem, fit: Agreed) -> Array:
@@ -157,8 +194,7 @@ def _grown(problem: Problem, triple: Sequence[int]) -> tuple[list[int], Agreed |
     best = _fitted(_of(problem, used))
     while best is not None and len(used) < len(problem.views):
         misses = _misses(problem, best)
-        floor = BAD_START_PX if len(used) == FEWEST_VIEWS else BAD_VIEW_PX
-        allowed = max(BAD_VIEW * float(np.median(misses[used])), floor)
+        allowed = max(BAD_VIEW * _of_majority(misses), BAD_VIEW_PX)
         near = [int(k) for k in np.argsort(misses) if k not in used and misses[k] <= allowed]
         if not near:
             return used, best

@@ -107,7 +107,7 @@ def residuals_of(solution: Solution) -> dict[str, Any]:
     views = []
     for k, view in enumerate(solution.problem.views):
         kept = adjusted.kept[k]
-        held_out = float(solution.held_out[k])
+        held_out = float(solution.held_out.errors[k])
         views.append(
             {
                 "name": view.name,

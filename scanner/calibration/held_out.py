@@ -14,52 +14,113 @@ from numpy.typing import NDArray
 
 from scanner.calibration.adjustment import Adjusted, adjust_again
 from scanner.calibration.lens_slopes import rotation_of
-from scanner.calibration.problem import SHEET, Problem, State, View, sheet_points
+from scanner.calibration.problem import POSES, SHEET, Problem, State, View, sheet_points
 
 Array = NDArray[np.float64]
 
 MOST_TRIED = 12
 """Views left out in turn; of more, as many evenly chosen."""
 FEWEST_LEFT = 3
-FEWEST_FOR_SPREAD = 8
-"""Views from which the jackknife's variance is worth using: it is known to the root of two over their number."""
+LEAST_EXPECTED = 1e-9
+"""Of the largest variance: what no view has to say, the priors' directions, moves by rounding alone."""
+FEWEST_FOR_SPREAD = 5
+"""Views from which the jackknife's variance is used: of four, each three make too loose a rig to tell."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """errors: (V,) px rms in the projector of each view, predicted by the others; NaN where not tried. inflation: by
-    which the formal covariance must be multiplied for the rig to move as much as it does from view to view; 1 or more.
+    """What leaving views out says.
+
+    errors: (V,) px rms in the projector of each view, predicted by the others; NaN where not tried. within: (V,) the
+    same by the rig that all of them made. covariance: (27, 27) as the adjustment's, widened to how much the rig moves
+    from view to view. widened: by how many times all sigmas were.
     """
 
     errors: Array
-    inflation: float = 1.0
+    within: Array
+    covariance: Array
+    widened: float = 1.0
+
+    @classmethod
+    def nothing(cls, adjusted: Adjusted) -> HeldOut:
+        """Of views that are not left out in turn."""
+        unknown = np.full(len(adjusted.kept), np.nan)
+        return cls(unknown, unknown, adjusted.covariance)
+
+    @property
+    def most(self) -> int | None:
+        """The view that the others predict worst; None where none was tried."""
+        return int(np.nanargmax(self.errors)) if np.isfinite(self.errors).any() else None
+
+    @property
+    def most_px(self) -> float:
+        """px by which they miss it; NaN where none was tried."""
+        return float("nan") if self.most is None else float(self.errors[self.most])
+
+    @property
+    def typical_px(self) -> float:
+        """px that the rig of all views leaves of one, their median."""
+        return float(np.median(self.within))
 
 
 def hold_out(problem: Problem, adjusted: Adjusted) -> HeldOut:
-    """Leave every view out in turn, of flat targets in more than three.
+    """Leave every view out in turn, of flat targets in more than three; only points that took part count.
 
-    The inflation is the jackknife's variance (Tukey 1958) over the formal one, median over the rig's parameters: what
-    is common to a whole view, such as blur or a sheet that bends anew each time, is seen by it and not by residuals.
+    Raises:
+        numpy.linalg.LinAlgError, ValueError: without one of them the problem is singular.
     """
-    count = len(problem.views)
-    errors = np.full(count, np.nan)
+    views = [view.only(kept) for view, kept in zip(problem.views, adjusted.kept, strict=True)]
+    count = len(views)
     if count <= FEWEST_LEFT or not problem.target.flat:
-        return HeldOut(errors)
+        return HeldOut.nothing(adjusted)
+    within = np.array([prediction(problem, adjusted.state, view)[1] for view in views])
+    errors = np.full(count, np.nan)
     tried = np.unique(np.linspace(0, count - 1, min(count, MOST_TRIED)).round().astype(int))
-    moved = []
+    moved, looser = [], []
     for k in tried:
         rest = [i for i in range(count) if i != k]
-        part = replace(problem, views=tuple(problem.views[i].only(adjusted.kept[i]) for i in rest))
+        part = replace(problem, views=tuple(views[i] for i in rest))
         begun = replace(adjusted.state, poses=adjusted.state.poses[rest])
-        others = adjust_again(part, begun, (adjusted.sigma_camera, adjusted.projector_factor))
-        errors[k] = prediction(problem, others, problem.views[k].only(adjusted.kept[k]))[1]
-        moved.append(others.vector()[: SHEET.start] - adjusted.state.vector()[: SHEET.start])
+        others, covariance = adjust_again(part, begun, (adjusted.sigma_camera, adjusted.projector_factor))
+        errors[k] = prediction(problem, others, views[k])[1]
+        moved.append(others.vector()[:POSES] - adjusted.state.vector()[:POSES])
+        looser.append(covariance - adjusted.covariance)
     if count < FEWEST_FOR_SPREAD:
-        return HeldOut(errors)
-    formal = np.diag(adjusted.covariance)[: SHEET.start]
-    spread = (count - 1) * np.mean(np.square(moved), axis=0)
-    known = formal > 0
-    return HeldOut(errors, max(1.0, float(np.median(spread[known] / formal[known]))))
+        return HeldOut(errors, within, adjusted.covariance)
+    return HeldOut(errors, within, *_widened(adjusted.covariance, np.array(moved), np.array(looser), count))
+
+
+def _widened(formal: Array, moved: Array, looser: Array, count: int) -> tuple[Array, float]:
+    """The formal covariance, and what the rig moves beyond it when views are left out (jackknife, Tukey 1958).
+
+    A rig without one view should move by what that view had to say: by the difference of both covariances. What is
+    common to a whole view, such as blur or a sheet that bends anew each time, moves it by more and is not seen by
+    residuals: the ratio of both variances, median over the rig's parameters, widens all. In a direction in which it
+    moves by more than chance makes of so many views (the largest eigenvalue of Marchenko and Pastur 1967), a few
+    contradict the others and bend it: what was seen there is added.
+
+    Args:
+        formal: (27, 27). moved: (n, 27) parameters without one view, less those of all. looser: (n, 27, 27) covariances
+            without it, less that of all. count: of views.
+
+    Returns:
+        the covariance, and the common factor of all sigmas.
+    """
+    known = np.flatnonzero(np.diag(formal) > 0)
+    sigmas = np.sqrt(np.diag(formal)[known])
+    steps = moved[:, known] / sigmas
+    expected = looser[:, known][:, :, known].mean(axis=0) / np.outer(sigmas, sigmas)
+    rig = known < SHEET.start
+    common = max(1.0, float(np.median(np.mean(np.square(steps[:, rig]), axis=0) / np.diag(expected)[rig])))
+    values, axes = np.linalg.eigh(expected)
+    root = axes * np.sqrt(np.maximum(values, values[-1] * LEAST_EXPECTED))
+    white = np.linalg.solve(root, steps.T)
+    ratios, directions = np.linalg.eigh(white @ white.T / len(moved))
+    bent = ratios > common * (1 + np.sqrt(len(known) / len(moved))) ** 2
+    along = root @ directions[:, bent] * np.sqrt((count - 1) * (ratios[bent] - common))
+    covariance = common * formal
+    covariance[np.ix_(known, known)] += along @ along.T * np.outer(sigmas, sigmas)
+    return covariance, float(np.sqrt(common))
 
 
 def prediction(problem: Problem, state: State, view: View) -> tuple[float, float]:

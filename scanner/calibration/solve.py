@@ -6,7 +6,6 @@ that cannot be is an error.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.calibration.adjustment import Adjusted
-from scanner.calibration.agreement import agreed
+from scanner.calibration.agreement import BAD_VIEW, agreed
 from scanner.calibration.coverage import not_met
 from scanner.calibration.drift import epipolar_offsets
-from scanner.calibration.held_out import HeldOut, hold_out
+from scanner.calibration.held_out import HeldOut
 from scanner.calibration.lens_slopes import rotation_of
 from scanner.calibration.observe import LeftOut, Observation, warm_up_of, warnings_of
 from scanner.calibration.plausibility import (
@@ -76,14 +75,14 @@ class SolveOptions:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A calibrated rig and how good it is. held_out: `HeldOut.errors`."""
+    """A calibrated rig and how good it is. adjusted: with the covariance of `held_out`."""
 
     target: Target
     options: SolveOptions
     problem: Problem
     adjusted: Adjusted
     facing: Facing
-    held_out: Array
+    held_out: HeldOut
     epipolar: tuple[Array, ...]
     """per view (N,) px in the projector"""
     left_out: tuple[LeftOut, ...]
@@ -93,8 +92,6 @@ class Solution:
     warm_up: Mapping[str, list[float]] = field(default_factory=dict)
     """see `warm_up_of`, of the captures used"""
     extra: Mapping[str, Any] = field(default_factory=dict)
-    widened: float = 1.0
-    """how many times its formal sigmas those of the covariance are, by `HeldOut.inflation`"""
 
     @property
     def state(self) -> State:
@@ -133,7 +130,7 @@ def solve(
     views = _without(views, odd, out)
     camera_size, projector_size = observations[0].camera_size, observations[0].projector_size
     check_motion(views, camera_size, target)
-    tell("adjusting")
+    tell("adjusting, and leaving views out")
     views = thinned(views)
     problem = Problem(
         target,
@@ -143,14 +140,13 @@ def solve(
         priors_of(options, target),
         stated_length(options.length, target),
     )
-    found = agreed(problem)
+    found = agreed(problem, leave_out=leave_out)
     problem, adjusted = found.problem, found.adjusted
     out += found.left_out
     check_state(problem, adjusted)
     warnings = check_stated(problem, adjusted.state, options.baseline_mm, options.distance_mm)
-    tell("leaving views out")
-    held_out = hold_out(problem, adjusted) if leave_out else HeldOut(np.full(len(problem.views), np.nan))
-    adjusted = replace(adjusted, covariance=held_out.inflation * adjusted.covariance)
+    held_out = found.held_out or HeldOut.nothing(adjusted)
+    adjusted = replace(adjusted, covariance=held_out.covariance)
     used = {view.name for view in problem.views}
     served = [o for o in observations if o.view.name in used]
     taken = sorted(o.created for o in served if o.created)
@@ -160,14 +156,13 @@ def solve(
         problem,
         adjusted,
         facing,
-        held_out.errors,
+        held_out,
         epipolar_errors(problem, adjusted.state),
         tuple(out),
         (),
         observations[0].response,
         (taken[0], taken[-1]) if taken else ("", ""),
         warm_up_of(served),
-        widened=math.sqrt(held_out.inflation),
     )
     return replace(solution, warnings=tuple(warnings + _warnings(solution) + warnings_of(served)))
 
@@ -264,6 +259,7 @@ def _warnings(solution: Solution) -> list[str]:
                 f"the poses cover {span[0]:.0%} x {span[1]:.0%} of the {side}'s picture: "
                 "what lies outside is extrapolated"
             )
+    warnings += _bending(solution)
     warnings += oblong_pixels(problem, adjusted.state)
     if lacking := not_met(problem, adjusted.state):
         warnings.append(lacking)
@@ -280,6 +276,20 @@ def _warnings(solution: Solution) -> list[str]:
             "measure it (--length)"
         )
     return warnings
+
+
+def _bending(solution: Solution) -> list[str]:
+    """Of a view that contradicts the others too little, or too many of them, to be left out."""
+    held_out = solution.held_out
+    if held_out.most is None or held_out.most_px <= BAD_VIEW * held_out.typical_px:
+        return []
+    name = solution.problem.views[held_out.most].name
+    return [
+        f"the views contradict each other, view {name} most: the others miss it by "
+        f"{held_out.most_px:.3f} px in the projector, where {held_out.typical_px:.3f} px are left of views that were "
+        "asked. In some captures the target moved or bent, or the picture was not sharp: uncertainties are widened by "
+        "it; capture again those whose held-out error is largest"
+    ]
 
 
 def sigmas(adjusted: Adjusted) -> Mapping[str, Array]:

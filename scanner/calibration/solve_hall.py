@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scanner.calibration.adjustment import Adjusted
 from scanner.calibration.discs import eccentricity
 from scanner.calibration.hall import decompose, focal_spread, hall_matrix, project_hall
+from scanner.calibration.held_out import HeldOut
 from scanner.calibration.lens_slopes import rotation_of, vector_of
 from scanner.calibration.observe import LeftOut, Observation, warm_up_of, warnings_of
 from scanner.calibration.plausibility import MOST_RELATIVE_SIGMA, Facing, check_facing
@@ -96,7 +97,7 @@ def solve_hall(
         problem,
         adjusted,
         facing,
-        np.array([np.nan]),
+        HeldOut.nothing(adjusted),
         epipolar_errors(problem, state),
         (*left_out, *others),
         (*warnings, *warnings_of([chosen])),

@@ -256,7 +256,9 @@ def _facts(
         facts.append(("translation", f"{told} mm"))
     facts.append(("sheet", _sheet(solution)))
     if content["covariance"] is not None:
-        facts.append(("+-", f"expanded uncertainty, k = 2, of each of these figures{_widened(solution.widened)}"))
+        facts.append(
+            ("+-", f"expanded uncertainty, k = 2, of each of these figures{_widened(solution.held_out.widened)}")
+        )
     residuals = content["residuals"]
     for name, of in (
         ("camera", "distances of points seen from points predicted"),

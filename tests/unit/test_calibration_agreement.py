@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scanner.calibration.observe import Observation
-from scanner.calibration.solve import SolveOptions, solve
+from scanner.calibration.solve import Solution, SolveOptions, sigmas, solve
 from scanner.calibration.targets import parse_target
 from scanner.errors import CalibrationError
 from tests.unit.calibration_bench import made_up_rig, observations, poses
@@ -42,6 +42,44 @@ def test_a_minority_of_wrong_views_is_named(count: int, bad: dict[int, tuple[str
     assert {one.name for one in found.left_out} == {f"pose{k:02d}" for k in bad}
     assert all("contradicts the other views" in one.reason for one in found.left_out)
     assert np.linalg.norm(found.state.translation - RIG.translation) < 1.0
+
+
+def moved_between_axes(count: int, bad: tuple[int, ...], off: float, seed: int) -> list[Observation]:
+    """Sharp views of which some moved down by camera px after the columns were captured: their rows are others'."""
+    every = observations(RIG, poses(count, seed=seed), target=SMALL, seed=seed, noise=(0.003, 0.005))
+    for k in bad:
+        view = every[k].view
+        rows = view.projector[:, 1] + off * view.slope[:, 1, 1]
+        every[k] = replace(every[k], view=replace(view, projector=np.column_stack((view.projector[:, 0], rows))))
+    return every
+
+
+def sigmas_off(found: Solution) -> float:
+    """Of the translation, the most."""
+    return float(np.max(np.abs(found.state.translation - RIG.translation) / sigmas(found.adjusted)["translation"]))
+
+
+@pytest.mark.parametrize(("bad", "seed"), [((0, 1, 2), 0), ((4, 6, 7), 0), ((2, 4, 7), 1)])
+def test_views_that_bend_the_rig_alike_are_named(bad: tuple[int, ...], seed: int) -> None:
+    """Three of eight, by half a pixel: rigs of three sound ones are missed by no sound one, and they by all."""
+    found = solve(SMALL, moved_between_axes(8, bad, 0.5, seed), LENGTH)
+    assert {one.name for one in found.left_out} == {f"pose{k:02d}" for k in bad}
+    assert sigmas_off(found) < 3
+
+
+def test_a_view_that_bends_the_rig_too_little_to_be_left_out_is_warned_of_and_widens_the_uncertainties() -> None:
+    every = moved_between_axes(12, (11,), 0.1, 1)
+    found, formal = solve(SMALL, every, LENGTH), solve(SMALL, every, LENGTH, leave_out=False)
+    assert found.left_out == formal.left_out == ()
+    assert sigmas_off(formal) > 4
+    assert sigmas_off(found) < 2
+    said = [warning for warning in found.warnings if "contradict each other" in warning]
+    assert len(said) == 1
+    assert "view pose11 most" in said[0]
+    assert found.held_out.most_px == pytest.approx(np.nanmax(found.held_out.errors))
+    clean = solve(SMALL, moved_between_axes(12, (), 0.0, 1), LENGTH)
+    assert not any("contradict each other" in warning for warning in clean.warnings)
+    assert sigmas_off(clean) < 3
 
 
 def test_without_a_majority_the_refusal_says_so() -> None:

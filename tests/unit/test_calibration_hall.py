@@ -113,7 +113,7 @@ def test_wedge_gives_the_rig(wedge: Target) -> None:
 def test_wedge_and_the_adjustment(wedge: Target) -> None:
     found = solve(wedge, seen(RIG, wedge), SolveOptions())
     assert found.state.translation == pytest.approx(RIG.translation, rel=0.05, abs=3)
-    assert np.isnan(found.held_out).all()
+    assert np.isnan(found.held_out.errors).all()
 
 
 def test_distortion_is_what_the_hall_model_lacks(wedge: Target) -> None:

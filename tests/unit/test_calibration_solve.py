@@ -77,8 +77,8 @@ def test_errors_lie_within_stated_sigmas() -> None:
 
 
 def test_held_out_views_are_predicted(solution: Solution) -> None:
-    assert np.isfinite(solution.held_out).all()
-    assert 0.005 < np.median(solution.held_out) < 0.02
+    assert np.isfinite(solution.held_out.errors).all()
+    assert 0.005 < np.median(solution.held_out.errors) < 0.02
 
 
 def test_errors_common_to_a_view_widen_the_covariance() -> None:
