@@ -28,9 +28,9 @@ BAD_VIEW = 4.0
 """A view whose residual is so many times the median of all views' is bad, and"""
 BAD_VIEW_PX = 0.15
 """more than this: sharp targets differ from pose to pose by their blur alone, within a tenth of a pixel."""
-DOUBTED = 2.0
+DOUBTED = 2.5
 """A view that the others miss by so many times what is typically left has all of them asked who agrees with whom: of
-sound ones, the worst is missed by 1.2 to 1.8 times that."""
+sound ones alike, the worst is missed by 1.2 to 2 times that."""
 DISC_ROUNDS = 3
 """Of adjustment and the discs' eccentricity in turn."""
 DRAWS = 24

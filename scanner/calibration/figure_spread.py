@@ -47,6 +47,9 @@ AT_ONCE = 64
 """Draws: ten megabytes"""
 FEWEST_OF_TARGET = 12
 """Points of a target by which the places of its marks are judged: an affine map takes twelve numbers from 36"""
+GRAZING_DEG = 70.0
+"""Between a ray and the normal: beyond, a pixel sees three times its width of the surface"""
+FEWEST_INNER = 100
 LIKELY = 0.95
 """Of all rigs that a covariance allows: those whose parameters are not farther from the calibration's"""
 _SEED = 2634
@@ -60,19 +63,22 @@ class Spread:
     """Standard uncertainties of one figure, in its own unit; None: unknown.
 
     reach: the half-width about the figure that holds COVERAGE of what the calibration makes of it, where that is not
-    two standard uncertainties: calibrations that are off make form grow and never shrink.
+    two standard uncertainties: calibrations that are off make form grow and never shrink. rim: bound of
+    what points that are seen at grazing angles do to it, added to U as a bias that nothing corrects (JCGM 100:2008,
+    F.2.4.5).
     """
 
     random: float | None
     calibration: float | None
     reach: float | None = None
+    rim: float = 0.0
 
     @property
     def expanded(self) -> float | None:
         """U, k = 2; None where one of them is unknown."""
         if self.random is None or self.of_calibration is None:
             return None
-        return float(np.hypot(COVERAGE_FACTOR * self.random, self.of_calibration))
+        return float(np.hypot(COVERAGE_FACTOR * self.random, self.of_calibration)) + self.rim
 
     @property
     def of_calibration(self) -> float | None:
@@ -81,7 +87,8 @@ class Spread:
 
     def as_dict(self) -> dict[str, float | None]:
         """For documents."""
-        return {"random": self.random, "calibration": self.calibration, "expanded": self.expanded}
+        parts = {"random": self.random, "calibration": self.calibration, "expanded": self.expanded}
+        return parts if self.rim == 0 else {**parts, "rim": self.rim}
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +117,12 @@ class Deviations:
 @dataclass(frozen=True, eq=False)
 class Feature:
     """How a kind of feature is measured. widths: figures that are the width which holds all but a share of the
-    deviations, with that share."""
+    deviations, with that share. of_rim: `Spread.rim` by points (n, 3), by name."""
 
     figures: Figures
     deviations: Callable[[Array], Deviations]
     widths: Mapping[str, float] = field(default_factory=dict)
+    of_rim: Figures = lambda _: {}
 
 
 def _from_plane(points: Array) -> Deviations:
@@ -132,8 +140,21 @@ def _from_sphere(points: Array) -> Deviations:
     return Deviations(length - radius, normals, np.column_stack((np.ones(len(points)), normals)))
 
 
+def _rim_of_sphere(points: Array) -> Mapping[str, float]:
+    """Of its diameter: pixels that look along a surface see a stretch of it, whose middle their value is not.
+
+    The error is the same in every scan. It is the difference to the sphere through the points that are not seen so.
+    """
+    centre, radius = sphere_through(points)
+    facing = -((points - centre) * points).sum(axis=1) / (radius * np.linalg.norm(points, axis=1))
+    inner = points[facing > np.cos(np.radians(GRAZING_DEG))]
+    if len(inner) < FEWEST_INNER:
+        return {}
+    return {"diameter_mm": float(abs(2 * (sphere_through(inner)[1] - radius)))}
+
+
 BOARD = Feature(board_figures, _from_plane, {"flatness_mm": LEFT_OUT})
-SPHERE = Feature(sphere_figures, _from_sphere, {"form_mm": LEFT_OUT, "shell_mm": OF_SHELL})
+SPHERE = Feature(sphere_figures, _from_sphere, {"form_mm": LEFT_OUT, "shell_mm": OF_SHELL}, _rim_of_sphere)
 
 
 def spread_of_figures(on: FeaturePoints, width: int, feature: Feature, rig: Rig | None) -> dict[str, Spread]:
@@ -149,16 +170,17 @@ def spread_of_figures(on: FeaturePoints, width: int, feature: Feature, rig: Rig 
     random = {name: float(share * np.std([one[name] for one in again], ddof=1)) for name in again[0]}
     off = feature.deviations(on.points).off
     random |= {name: _of_width(off, left_out) for name, left_out in feature.widths.items()}
+    rim = feature.of_rim(on.points)
     points, at = _some(on, WIDTH_POINTS)
     moves = None if rig is None else rig.spread(points, at // width, at % width)
     if moves is None:
-        return {name: Spread(random[name], None) for name in random}
+        return {name: Spread(random[name], None, rim=rim.get(name, 0.0)) for name in random}
     # What the calibration has done to the form is in the points already: drawn on top of it, it would count twice.
     points = points - _likely_part(moves, feature.deviations(points))
     few = slice(None, None, -(-len(points) // POINTS))
     of_rig = _of_rig(points[few], PointSpread(moves.slopes[few], moves.covariance), feature)
     of_rig |= _of_rig_in_widths(points, moves, feature)
-    return {name: Spread(random[name], *of_rig[name]) for name in random}
+    return {name: Spread(random[name], *of_rig[name], rim.get(name, 0.0)) for name in random}
 
 
 def _some(on: FeaturePoints, most: int) -> tuple[Array, NDArray[np.intp]]:

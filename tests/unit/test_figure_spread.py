@@ -14,7 +14,7 @@ from scanner.calibration import figure_spread
 from scanner.calibration.beyond_noise import beyond_noise
 from scanner.calibration.detection import Detection
 from scanner.calibration.features import spread
-from scanner.calibration.figure_spread import BOARD, SPHERE, Rig, spread_of_figures, spread_of_length
+from scanner.calibration.figure_spread import BOARD, SPHERE, Rig, Spread, spread_of_figures, spread_of_length
 from scanner.calibration.repeat_spread import half_width
 from scanner.calibration.targets import parse_target
 from scanner.calibration.verification import (
@@ -103,6 +103,30 @@ def test_the_random_part_is_what_other_noise_makes_of_it():
         assert stated[name].random == pytest.approx(seen, rel=0.55)
         assert stated[name].calibration is None
         assert stated[name].expanded is None
+
+
+@pytest.mark.parametrize("outward_mm", [0.0, 0.3])
+def test_a_rim_that_is_off_is_in_the_diameters_uncertainty(outward_mm):
+    """Points at more than 75 degrees lie outward: U has what the diameter is off by them, and next to nothing else."""
+    generator = np.random.default_rng(3)
+    facing = generator.uniform(np.cos(np.radians(85)), 1, 20_000)
+    turn = generator.uniform(0, 2 * np.pi, facing.size)
+    across = np.sqrt(1 - facing**2)
+    normals = np.stack((across * np.cos(turn), across * np.sin(turn), -facing), axis=1)
+    off = generator.normal(0, 0.01, facing.size) + np.where(facing < np.cos(np.radians(75)), outward_mm, 0.0)
+    points = np.array([0.0, 0.0, 5e4]) + (RADIUS + off)[:, None] * normals
+    found = spread_of_figures(FeaturePoints(points, np.zeros(len(points), np.intp), 1.0), WIDTH, SPHERE, None)
+    error = sphere_figures(points)["diameter_mm"] - 2 * RADIUS
+    assert abs(error) <= found["diameter_mm"].rim + 2 * found["diameter_mm"].random
+    assert found["diameter_mm"].rim < 1.5 * abs(error) + 0.001
+    assert {name for name, spread in found.items() if spread.rim} == {"diameter_mm"}
+
+
+def test_the_rim_comes_on_top_of_u():
+    spread = Spread(0.003, 0.002, rim=0.01)
+    assert spread.expanded == pytest.approx(2 * np.hypot(0.003, 0.002) + 0.01)
+    assert spread.as_dict()["rim"] == 0.01
+    assert "rim" not in Spread(0.003, 0.002).as_dict()
 
 
 def bending_rig():
