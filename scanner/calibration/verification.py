@@ -29,6 +29,8 @@ from scanner.calibration.repeat_spread import half_width
 from scanner.calibration.targets import Target
 from scanner.errors import DecodeError
 
+WILD = 100.0
+"""Times the others' variance that no noise has: of three scans, chi-square with two freedoms, one pixel in e^100"""
 LEFT_OUT = 0.003
 """Share of points that may be left out (VDI/VDE 2634-2, 2012, sec. 6)."""
 OF_SHELL = 0.05
@@ -284,8 +286,7 @@ def repeatability(scans: Sequence[NDArray[Any]]) -> Repeatability:
         raise DecodeError(f"{int(common.sum())} pixels have a point in every scan, {FEWEST_POINTS} are needed")
     values = depth[:, common]
     variance = values.var(axis=0, ddof=1)
-    # Three pixels in a thousand may be left out here too: one on a depth edge may belong to either side.
-    kept = variance <= np.quantile(variance, 1 - LEFT_OUT)
+    kept = variance <= _wild(variance)
     drift = (values - values.mean(axis=0))[:, kept].mean(axis=1)
     return Repeatability(
         depth_mm=float(np.sqrt(variance[kept].mean())),
@@ -294,6 +295,13 @@ def repeatability(scans: Sequence[NDArray[Any]]) -> Repeatability:
         scans=len(scans),
         points=int(kept.sum()),
     )
+
+
+def _wild(variance: Array) -> float:
+    """The most that is taken for noise: three pixels in a thousand may be left out here too, since one on a depth edge
+    may belong to either side, but none that differs from the others as noise does."""
+    most = float(np.quantile(variance, 1 - LEFT_OUT))
+    return max(most, WILD * float(variance[variance <= most].mean()))
 
 
 def local_point(xyz: NDArray[Any], at: Array, reach: int = 4) -> Array | None:

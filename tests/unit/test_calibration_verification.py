@@ -138,7 +138,7 @@ def test_repeatability_is_the_noise_and_the_drift() -> None:
     scans = [board(0.04, seed=k) for k in range(8)]
     steep = np.cos(np.radians(20))
     found = repeatability(scans)
-    # Noise along the board's normal: its depth part, less the three pixels in a thousand that vary most.
+    # Noise along the board's normal: its depth part.
     assert found.depth_mm == pytest.approx(0.04 * steep, rel=0.03)
     assert found.drift_mm < 0.002
     moved = repeatability([*scans, scans[0] + np.array([0.0, 0.0, 0.9])])
@@ -147,6 +147,19 @@ def test_repeatability_is_the_noise_and_the_drift() -> None:
         repeatability([scans[0], scans[0][:50]])
     with pytest.raises(DecodeError, match="point in every scan"):
         repeatability([scans[0], np.full_like(scans[0], np.nan)])
+
+
+def test_repeatability_of_few_scans_is_that_of_many_and_pixels_on_depth_edges_have_no_part_in_it() -> None:
+    scans = [board(0.04, seed=k) for k in range(8)]
+    every = np.stack([scan[..., 2] for scan in scans])
+    few, many = repeatability(scans[:3]), repeatability(scans)
+    assert many.depth_mm == pytest.approx(float(np.sqrt(np.nanmean(every.var(axis=0, ddof=1)))), rel=1e-6)
+    assert few.expanded_mm is not None
+    assert few.depth_mm == pytest.approx(many.depth_mm, abs=2 * few.expanded_mm)
+    edge = [scan.copy() for scan in scans]
+    edge[0][40, 10:20] += 30.0
+    assert repeatability(edge).depth_mm == pytest.approx(many.depth_mm, rel=1e-3)
+    assert repeatability(edge).points == many.points - 10
 
 
 def test_point_between_pixels_is_on_the_surface() -> None:
