@@ -9,19 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 from scanner.calibration.grey_levels import LevelResponse
-from scanner.calibration.response import Response
+from scanner.calibration.response import BIAS, Response
 from scanner.digits import with_uncertainty
-
-PRINT_BIAS = 0.03
-"""Bound on the share by which fringes on a print tell an exponent wrong. Prints of the simulator (ChArUco, chessboard)
-told 1.002 and 1.003 for 1.000, 1.198 and 1.199 for 1.211: 1.1 % low where
-light is bent, as a plain board does (1.196), since blur takes more from overtones than from fringes. Twice that, and
-what other lenses may have."""
-
-
-def expanded(found: Response) -> float:
-    """Uncertainty of the exponent, k = 2: noise, and the bound on the bias added to it (JCGM 100:2008, F.2.4.5)."""
-    return 2 * found.sigma + PRINT_BIAS * found.exponent
 
 
 def checked(found: Response, levels: LevelResponse | None) -> tuple[dict[str, Any] | None, tuple[str, ...]]:
@@ -34,10 +23,10 @@ def checked(found: Response, levels: LevelResponse | None) -> tuple[dict[str, An
     Returns:
         `response.projector` of a calibration file where only fringes tell it, else None; and the lines to say.
     """
-    unsure = expanded(found)
+    unsure = found.expanded
     seen = (
         f"response by the target's fringes, a check: light follows what is projected to the power of "
-        f"{with_uncertainty(found.exponent, unsure)} (k = 2, {PRINT_BIAS:.0%} of it for print)"
+        f"{with_uncertainty(found.exponent, unsure)} (k = 2, {BIAS:.0%} of it for blur)"
     )
     if levels is not None:
         return None, (f"{seen}; the file has what grey levels told", *_against_levels(found, levels, unsure))

@@ -167,14 +167,18 @@ def _write(path: Path, of_projector: dict[str, Any] | None) -> None:
 
 
 def _facts(found: LevelResponse | Response) -> list[tuple[str, str]]:
-    from scanner.calibration.response import Response  # noqa: PLC0415
+    from scanner.calibration.response import BIAS, Response  # noqa: PLC0415
 
     if isinstance(found, Response):
-        exponent = with_uncertainty(found.exponent, 2 * found.sigma)
-        projected = "" if found.gamma is None else f"{found.gamma:.3f}"
+        exponent = with_uncertainty(found.exponent, found.expanded)
+        share = found.expanded / found.exponent
+        projected = "" if found.gamma is None else with_uncertainty(found.gamma, share * found.gamma)
         return [
             ("exponent", f"{exponent} (k = 2) left in this capture (1: the light is linear)"),
-            ("+-", "by the frames' noise alone; blur makes an exponent up to some 1 % low"),
+            (
+                "+-",
+                f"{BIAS:.0%} of it, by which blur draws an exponent towards 1, and noise; grey levels know it better",
+            ),
             ("ripple", f"{found.ripple_px:.3f} projector px rms in this capture"),
             ("misfit", f"{found.misfit_before:.2%} of the fringes, {found.misfit_after:.2%} with this exponent"),
             ("gamma to undo", projected or "the table used, followed by light ^ (1 / exponent)"),

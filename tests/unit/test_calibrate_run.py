@@ -215,7 +215,7 @@ def test_what_grey_levels_told_stays_and_the_first_pose_checks_it(
     looped.run()
     assert looped.response == {"gamma": 2.2}
     said = capsys.readouterr().err
-    assert "to the power of 1.600 +- 0.068 (k = 2, 3% of it for print); the file has what grey levels told" in said
+    assert "to the power of 1.60 +- 0.10 (k = 2, 5% of it for blur); the file has what grey levels told" in said
     assert "fringes contradict grey levels: they should have told 2.200, and 0.600 is more" in said
 
 
