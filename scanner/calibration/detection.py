@@ -103,7 +103,9 @@ def _charuco(picture: NDArray[np.float32], grey: NDArray[np.uint8], target: Targ
     if len(best_ids) < max(FEWEST_POINTS, FEWEST_SHARE * whole):
         if _is_mirrored(grey, target):
             return NotFound("the board is seen in a mirror: switch the mirroring of the camera's picture off")
-        return NotFound(f"{len(best_ids)} of {whole} corners of the ChArUco board in the picture")
+        return NotFound(
+            f"{len(best_ids)} of {whole} corners of the ChArUco board in the picture; {_markers(grey, target)}"
+        )
     grid = np.full((whole, 2), np.nan)
     grid[best_ids] = best
     return _measured(picture, target, best_ids, grid.reshape(target.rows - 1, target.columns - 1, 2))
@@ -114,6 +116,19 @@ def charuco_board(target: Target) -> Any:
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
     size = (target.columns, target.rows)
     return cv2.aruco.CharucoBoard(size, float(target.spacing_mm), float(target.marker_mm), dictionary)
+
+
+def _markers(grey: NDArray[np.uint8], target: Target) -> str:
+    """Why a board that is there may not have been found, by its markers."""
+    dictionary = charuco_board(target).getDictionary()
+    corners, _, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(grey)
+    if not corners:
+        return (
+            "no marker of its dictionary was read: none is there, it is another dictionary, or they are too small, "
+            "blurred or dark"
+        )
+    counts = f"{target.columns} x {target.rows}"
+    return f"{len(corners)} markers were read: the board is partly seen, or has other counts than {counts}"
 
 
 def _is_mirrored(grey: NDArray[np.uint8], target: Target) -> bool:

@@ -20,10 +20,11 @@ from scanner.calibration.copies import again, capture_key
 from scanner.calibration.detection import FEWEST_POINTS, NotFound, detect
 from scanner.calibration.markers import of_another_kind
 from scanner.calibration.problem import View
-from scanner.calibration.projector_points import projector_points
+from scanner.calibration.projector_points import LEAST_REACH_PX, projector_points
 from scanner.calibration.targets import Target
-from scanner.capture import Capture
-from scanner.decode import Decoded, Decoder, decoder_for
+from scanner.capture import FRAMES_FILE, Capture
+from scanner.decode import Decoded, Decoder, Reason, decoder_for
+from scanner.decode.reasons import tally
 from scanner.errors import ConfigError, DecodeError, ScannerError, SyncError
 from scanner.sequencer import check_capture
 
@@ -144,6 +145,8 @@ def observe_capture(path: Path, name: str, target: Target, *, doubt_kind: bool =
         return LeftOut(name, f"frames out of step: {error}", out_of_step=True)
     except ScannerError as error:
         said = str(error) if error.hint is None else f"{error}; {error.hint}"
+        if path.is_dir() and not (path / HEADER_FILE).is_file():
+            said = f"no {HEADER_FILE} in it: nothing was captured here, or the file was lost"
         return LeftOut(name, said.replace(f"{path}/", ""), unreadable=True)
     view = observe_decoded(name, decoded, target, white=white, mosaic=capture.header.camera.mosaic is not None)
     if isinstance(view, LeftOut):
@@ -201,12 +204,27 @@ def observe_decoded(
     seen = projector_points(decoded, found.points, found.spacing)
     kept = np.isfinite(seen.points).all(axis=1) & np.isfinite(seen.slope).all(axis=(1, 2))
     if kept.sum() < FEWEST_POINTS:
-        return LeftOut(name, f"the projector's pixel is known of {int(kept.sum())} points only: light the whole target")
+        return LeftOut(
+            name, f"the projector's pixel is known of {int(kept.sum())} points only: {_why(decoded, found.points)}"
+        )
     on_target = target.points[found.ids[kept]]
     extents = np.linalg.svd(on_target - on_target.mean(axis=0), compute_uv=False)
     if extents[1] < FLATTEST * extents[0]:
         return LeftOut(name, "the points that are seen lie on a line")
     return View(name, found.ids[kept], found.points[kept], seen.points[kept], seen.sigma[kept], seen.slope[kept])
+
+
+def _why(decoded: Decoded, points: NDArray[Any]) -> str:
+    """What to do about most of a target's points whose surroundings have no value."""
+    at = np.clip(np.rint(points[:, ::-1]).astype(int), 0, np.array(decoded.reason.shape) - 1)
+    around = np.zeros(decoded.reason.shape, np.uint8)
+    around[at[:, 0], at[:, 1]] = 1
+    near = cv2.dilate(around, np.ones((2 * LEAST_REACH_PX + 1,) * 2, np.uint8)).astype(bool)
+    causes = tally(decoded.reason[near])
+    causes[Reason.VALUE] = 0
+    if int(np.argmax(causes)) == Reason.CLIPPED:
+        return "it is overexposed: expose for less (--exposure auto), lower the gain, or close the lens"
+    return "light the whole target with the projector, and expose until its white is bright"
 
 
 def _finished(decoder: Decoder, capture: Capture) -> Decoded:
@@ -220,12 +238,15 @@ def _finished(decoder: Decoder, capture: Capture) -> Decoded:
 
 
 def _below(folder: Path, depth: int) -> Iterator[Path]:
-    if (folder / HEADER_FILE).is_file():
+    """Captures; and what should be one: frames without a header, and folders with nothing in them."""
+    if (folder / HEADER_FILE).is_file() or (folder / FRAMES_FILE).is_file():
         yield folder
     elif depth:
         for child in folder.iterdir():
-            if child.is_dir():
+            if child.is_dir() and any(child.iterdir()):
                 yield from _below(child, depth - 1)
+            elif child.is_dir():
+                yield child
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

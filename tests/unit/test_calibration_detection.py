@@ -68,7 +68,7 @@ def test_what_is_not_there_is_said() -> None:
     empty = np.full(SIZE[::-1], 100.0, np.float32)
     for spec, words in (
         ("chessboard:9x6:25", "no chessboard of 9 x 6"),
-        ("charuco:8x6:28", "0 of 35 corners"),
+        ("charuco:8x6:28", "0 of 35 corners of the ChArUco board in the picture; no marker"),
         ("circles:7x5:32", "no grid of 7 x 5 circles"),
     ):
         found = detect(empty, parse_target(spec))
@@ -79,6 +79,13 @@ def test_what_is_not_there_is_said() -> None:
     black = detect(np.full((60, 80), np.nan, np.float32), parse_target("chessboard:9x6:25"))
     assert isinstance(black, NotFound)
     assert "black" in black.reason
+
+
+def test_a_charuco_board_of_other_counts_is_doubted_by_its_markers() -> None:
+    found = detect(drawn(parse_target("charuco:8x6:28")), parse_target("charuco:6x8:28"))
+    assert isinstance(found, NotFound)
+    assert "24 markers were read" in found.reason
+    assert "other counts than 6 x 8" in found.reason
 
 
 def test_charuco_board_in_a_mirror_is_named() -> None:

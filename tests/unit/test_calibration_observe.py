@@ -154,6 +154,32 @@ def test_poses_are_counted_as_people_count(tmp_path: Path) -> None:
     assert [path.name for path in find_captures([one, tmp_path, one])] == ["1", "2", "10", "b1"]
 
 
+def test_what_should_be_a_capture_and_is_none_is_named(poses: Path, tmp_path: Path) -> None:
+    """Frames without a header, and a folder with nothing in it; a folder of other things is no pose."""
+    shutil.copytree(poses / "p04" / "capture", tmp_path / "1" / "capture")
+    (tmp_path / "1" / "capture" / "capture.json").unlink()
+    (tmp_path / "2").mkdir()
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "read me").write_text("")
+    shutil.copytree(poses / "p06" / "capture", tmp_path / "3" / "capture")
+    observations, left_out = observe(find_captures([tmp_path]), TARGET)
+    assert [one.view.name for one in observations] == ["3"]
+    assert [one.name for one in left_out] == ["1", "2"]
+    assert all(one.reason.startswith("no capture.json in it") and one.unreadable for one in left_out)
+
+
+@pytest.mark.parametrize(("gain", "words"), [(40.0, "it is overexposed"), (0.005, "light the whole target")])
+def test_a_target_whose_pixels_have_no_value_says_what_to_do(poses: Path, gain: float, words: str) -> None:
+    capture = Capture.open(poses / "p04" / "capture")
+    white = capture.frame(0)
+    decoder = decoder_for(capture.header.sequence, capture.header.camera)
+    for k in range(len(capture.header.sequence)):
+        decoder.add(k, np.clip(np.rint(gain * capture.frame(k).astype(float)), 0, 255).astype(np.uint8))
+    outcome = observe_decoded("p", decoder.finish(), TARGET, white=white)
+    assert isinstance(outcome, LeftOut)
+    assert words in outcome.reason
+
+
 def test_damaged_captures_are_left_out(poses: Path, tmp_path: Path) -> None:
     (tmp_path / "capture.json").write_text("{")
     found = observe_capture(tmp_path, "broken", TARGET)
