@@ -48,7 +48,7 @@ def without_ripple(decoded: Decoded, sequence: PatternSequence) -> Decoded:
     if not light:
         return decoded
     maps: dict[Axis, Map | None] = {"y": decoded.rows, "x": decoded.columns}
-    told, said = dict(light), list[str]()
+    told, said, before = dict(light), list[str](), decoded.warnings
     for axis in pattern.axes:
         harmonics = [dict(h) for h in light[axis]["harmonics"]]
         finest = max(range(len(harmonics)), key=lambda k: harmonics[k]["frequency"])
@@ -60,12 +60,21 @@ def without_ripple(decoded: Decoded, sequence: PatternSequence) -> Decoded:
         per_px = harmonics[finest]["frequency"] / sequence.projector.along(axis)
         _take_off(straight.reshape(-1), _table(harmonics[finest]), pattern.origin, per_px)
         maps[axis] = straight
+        before = tuple(_as_found(warning, axis, found["sigma_px"]) for warning in before)
         harmonics[finest] |= {"ripple_px": found["sigma_px"], "corrected": True}
         told[axis] = {**light[axis], "harmonics": harmonics}
     details = {**decoded.details, "light": told}
     return replace(
-        decoded, rows=maps["y"], columns=maps["x"], details=details, warnings=(*decoded.warnings, *said)
+        decoded, rows=maps["y"], columns=maps["x"], details=details, warnings=(*before, *said)
     )  # fmt: skip
+
+
+def _as_found(warning: str, axis: Axis, sigma_px: float) -> str:
+    """A warning of the ripple, which is taken off now: what it says was before that."""
+    if not warning.startswith(f"ripple along {axis}: "):
+        return warning
+    seen = warning.rsplit(": ", 1)[0]
+    return f"{seen}: taken off (--correct-ripple), as far as these frames tell it (1 sigma {sigma_px:.3f} px)"
 
 
 def _nothing_to_correct(finest: Mapping[str, Any]) -> str | None:

@@ -214,6 +214,10 @@ def test_a_ripple_can_be_taken_off(exponent):
     assert after < 1.1 * noise
     told = of_set(straight)
     assert told["corrected"]
+    (warned,), (corrected,) = found.warnings, straight.warnings
+    assert warned.startswith("ripple along y: frequencies differ by")
+    assert "measure the response" not in corrected
+    assert ": taken off (--correct-ripple)" in corrected
     assert told["ripple_px"] < 0.3 * of_set(found)["ripple_px"]
     np.testing.assert_array_equal(np.isnan(straight.rows), np.isnan(found.rows))
 
