@@ -118,7 +118,8 @@ def _uncertainty(scan: Scan) -> list[tuple[str, str]]:
     if (within := budget.get("within_mm")) is not None:
         least = "at least " if "method" in budget.get("unknown", ()) else ""
         told.append((f"{least}± {alone(within)}", STATED))
-    if scan.sigma_z is not None and (sigma := _sample(scan.sigma_z)).size:
+    # Of codes the cells' width is no chance: their budget has no random part.
+    if budget.get("random_mm") != 0 and scan.sigma_z is not None and (sigma := _sample(scan.sigma_z)).size:
         told.append((f"± {alone(2 * float(np.median(sigma)))}", "mm random (k = 2)"))
     return told
 

@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 CALIBRATION_FILE = "calibration.json"
 RESULT_PICTURE = "calibration.png"
 LIVE_PICTURE = "calibrate.png"
+SAID_EVERY_S = 10.0
+"""With nobody at a terminal: what is waited for."""
 PATIENCE_S = 60.0
 """With nobody at a terminal: without a new pose for so long the run ends with what there is."""
 SEE_S = 0.2
@@ -225,6 +227,7 @@ class _Loop:
         self._new = Stillness
         self._seen: Any = "no picture of the camera yet"
         self._progress_s = time.monotonic()
+        self._said_after_s = SAID_EVERY_S
         self._told = False
         self._advice = ""
         self._levels = levels
@@ -246,10 +249,20 @@ class _Loop:
             ready = self._look()
             if (key in "\r\n" and key) or (self._auto and ready):
                 self._capture()
-            if not self._keys.there and time.monotonic() - self._progress_s > PATIENCE_S:
-                say(f"no new pose for {PATIENCE_S:.0f} s: {self._last_line()}")
+            if not self._keys.there and self._waited_out():
                 break
         clear_line()
+
+    def _waited_out(self) -> bool:
+        """Whether no new pose came for long; what it waits for is said now and then: nobody sees a drawn line."""
+        waits_s = time.monotonic() - self._progress_s
+        if waits_s > PATIENCE_S:
+            say(f"no new pose for {PATIENCE_S:.0f} s: {self._last_line()}")
+            return True
+        if waits_s > self._said_after_s:
+            self._said_after_s += SAID_EVERY_S
+            say(f"no new pose for {waits_s:.0f} s (ends after {PATIENCE_S:.0f}): {self._last_line()}")
+        return False
 
     def _look(self) -> bool:
         """Look at the newest picture; whether the target has stood still in a new pose."""
@@ -281,7 +294,7 @@ class _Loop:
         if self._still is not None:
             self._still.forget()
         if good:
-            self._progress_s = time.monotonic()
+            self._progress_s, self._said_after_s = time.monotonic(), SAID_EVERY_S
             self._tell_response()
             self._say_next()
 

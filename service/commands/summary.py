@@ -15,6 +15,8 @@ from service.terminal import print_error, print_facts, print_json
 LEAST_S = 0.1
 """Stages shorter than this are not listed."""
 
+NEGLIGIBLE = 0.001
+"""Of the other part: a millionth of the variance"""
 LEAST_SATURATED = 0.0005
 """A share that is not printed as 0.0 %"""
 
@@ -174,10 +176,11 @@ def _uncertainty(budget: Mapping[str, Any], few: str) -> tuple[str, str] | None:
 def _of_median(budget: Mapping[str, Any]) -> str:
     """The median point's figure and its parts, whose squares add up to its square, all with the same k.
 
-    A kind of which nothing is known has no part, not one of 0.
+    A kind of which nothing is known has no part, not one of 0, and neither has one that changes no digit.
     """
     k = budget["coverage_factor"]
-    parts = {kind: k * budget[f"{kind}_mm"] for kind in ("random", "systematic") if budget[f"{kind}_mm"]}
+    each = {kind: k * budget[f"{kind}_mm"] for kind in ("random", "systematic")}
+    parts = {kind: part for kind, part in each.items() if part > NEGLIGIBLE * max(each.values())}
     words = [f"+-{alone(part)} mm {kind}" for kind, part in parts.items()]
     words += [f"mostly {dominant['name']}"] if (dominant := budget.get("dominant")) else []
     return (

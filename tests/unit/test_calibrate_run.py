@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import sys
 from pathlib import Path
@@ -132,6 +133,18 @@ def test_with_nobody_there_it_ends_when_nothing_new_comes(
     session = Session("the picture is dark")
     loop(session, tmp_path, Keys(None))
     assert "the picture is dark" in capsys.readouterr().err
+
+
+def test_with_nobody_there_it_says_now_and_then_what_it_waits_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now_s = itertools.count()
+    monkeypatch.setattr(calibrate_run.time, "monotonic", lambda: float(next(now_s)))
+    loop(Session("the picture is dark"), tmp_path, Keys(None))
+    said = [line for line in capsys.readouterr().err.splitlines() if "no new pose" in line]
+    assert said[0] == "no new pose for 11 s (ends after 60): the picture is dark"
+    assert len(said) == 6
+    assert said[-1] == "no new pose for 60 s: the picture is dark"
 
 
 def test_keys_come_one_by_one_from_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -46,6 +46,8 @@ def test_the_title_says_what_its_figures_are(scan):
     assert left_out(with_budget) == "unknown, and not in it: calibration"
     below = np.s_[58:80, 140:]
     assert preview_picture(with_budget)[below].std() > 2 * preview_picture(scan)[below].std()
+    of_code = scan.with_report(uncertainty={"within_mm": 0.1514, "random_mm": 0.0, "unknown": []})
+    assert "mm random (k = 2)" not in {caption for _, caption in figures(of_code)}
     of_mcp = scan.with_report(uncertainty={"within_mm": 0.1514, "unknown": ["method"]})
     assert ("at least ± 0.15", "mm for 95 % of points") in figures(of_mcp)
 

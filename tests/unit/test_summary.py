@@ -122,6 +122,10 @@ def test_what_a_method_adds_unknown_gets_no_figure_of_the_whole(
         in printed
     )
     assert "(k = 2): +-0.14 mm random; unknown, and not in it: calibration, print" in printed
+    budget["systematic_mm"] = 4e-7
+    (tmp_path / "report.json").write_text(json.dumps(report), encoding="utf-8")
+    report_result(tmp_path, 1.0, {}, as_json=False)
+    assert "(k = 2): +-0.14 mm random; unknown" in capsys.readouterr().out, "a nanometre is no part"
     assert "unknown, and not in it: calibration, print" in printed
     assert "systematic" not in printed, "nothing is known of it: that is no 0"
 
