@@ -123,12 +123,9 @@ def _searched(problem: Problem, whole: Agreed | None, *, leave_out: bool) -> Agr
     every = whole if whole is not None and not whole.left_out else _fitted(problem)
     every = _held_out(every) if every is not None and leave_out else every
     ranked = sorted(((_score(problem, triple), triple) for triple in _triples(count)), key=lambda trial: trial[0])
-    groups = [_grown(problem, triple) for score, triple in ranked[:GROWN] if np.isfinite(score)]
-    found = [
-        (used, _held_out(fit) if leave_out else fit)
-        for used, fit in groups
-        if fit is not None and count // 2 < len(used) < count
-    ]
+    grown = [_grown(problem, triple) for score, triple in ranked[:GROWN] if np.isfinite(score)]
+    groups = {tuple(used): fit for used, fit in grown if fit is not None and count // 2 < len(used) < count}
+    found = [(used, _held_out(fit) if leave_out else fit) for used, fit in groups.items()]
     found = [group for group in found if every is None or _clearer(group[1], every)]
     if not found:
         return None

@@ -111,7 +111,8 @@ def _widened(formal: Array, moved: Array, looser: Array, count: int) -> tuple[Ar
     steps = moved[:, known] / sigmas
     expected = looser[:, known][:, :, known].mean(axis=0) / np.outer(sigmas, sigmas)
     rig = known < SHEET.start
-    common = max(1.0, float(np.median(np.mean(np.square(steps[:, rig]), axis=0) / np.diag(expected)[rig])))
+    likely = np.maximum(np.diag(expected)[rig], LEAST_EXPECTED)
+    common = max(1.0, float(np.median(np.mean(np.square(steps[:, rig]), axis=0) / likely)))
     values, axes = np.linalg.eigh(expected)
     root = axes * np.sqrt(np.maximum(values, values[-1] * LEAST_EXPECTED))
     white = np.linalg.solve(root, steps.T)
