@@ -5,21 +5,27 @@
 
 from __future__ import annotations
 
+import ast
+import dataclasses
 import inspect
 import json
 import sys
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import typer
 
+from drivers.simulated.faults import FOREVER
+from drivers.simulated.options import option_kinds
 from service.config import RigConfig
 from service.program import app
 
 HERE = Path(__file__).parent
 GOLDEN = HERE.parent / "tests" / "golden" / "trigger"
 DIAGRAMS = ("<!-- diagrams: begin -->\n", "<!-- diagrams: end -->")
+OPTIONS = ("<!-- options: begin -->\n", "<!-- options: end -->")
 COLUMNS = 96
 
 CLI_HEAD = """# Command line
@@ -52,8 +58,56 @@ def pages() -> dict[Path, str]:
     return {
         HERE / "reference" / "cli.md": CLI_HEAD + "".join(_commands()),
         HERE / "reference" / "rig-file.md": RIG_HEAD + "".join(_tables(RigConfig, ())),
+        HERE / "reference" / "simulated-rigs.md": _with_options(HERE / "reference" / "simulated-rigs.md"),
         HERE / "reference" / "trigger-protocol.md": _with_diagrams(HERE / "reference" / "trigger-protocol.md"),
     }
+
+
+def _with_options(page: Path) -> str:
+    """The page with the tables of what may stand behind a simulated rig's question mark between its marks."""
+    before, rest = page.read_text(encoding="utf-8").split(OPTIONS[0])
+    after = rest.partition(OPTIONS[1])[2]
+    tables = (f"\n### {title}\n\n{_fields(kinds)}" for title, kinds in option_kinds().items())
+    return before + OPTIONS[0] + "".join(tables) + OPTIONS[1] + after
+
+
+def _fields(kinds: tuple[type[Any], ...]) -> str:
+    rows = [
+        f"| `{f.name}` | {_words(kind, f.name)} | {_range(f)} |\n" for kind in kinds for f in dataclasses.fields(kind)
+    ]
+    return "| Option | | Default; allowed |\n|---|---|---|\n" + "".join(rows)
+
+
+def _words(kind: type[Any], name: str) -> str:
+    """The string that stands below a field in its class."""
+    body = cast("ast.ClassDef", ast.parse(inspect.getsource(kind)).body[0]).body
+    for field, said in pairwise(body):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and field.target.id == name:
+            if isinstance(said, ast.Expr) and isinstance(said.value, ast.Constant):
+                return " ".join(str(said.value.value).split()).replace("|", r"\|")
+            break
+    raise ValueError(f"{kind.__name__}.{name} has no words")
+
+
+def _range(field: Any) -> str:
+    """Default and limits, as they are written in a device string."""
+    default, limits = field.default, field.metadata
+    shown = "none" if default in (None, "", ()) else _written(default)
+    if "choices" in limits:
+        return f"`{shown}`; " + ", ".join(f"`{choice}`" for choice in limits["choices"])
+    if isinstance(default, bool):
+        return f"`{shown}`; `true`, `false`"
+    if isinstance(default, tuple):
+        return f"{shown}; numbers, `3,7`"
+    if "high" in limits:
+        return f"{shown}; {_written(limits['low'])} to {_written(limits['high'])}"
+    return f"{shown}; {_written(limits['low'])} or more" if "low" in limits else shown
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "always" if value == FOREVER else f"{value:.10g}" if isinstance(value, int | float) else str(value)
 
 
 def _with_diagrams(page: Path) -> str:

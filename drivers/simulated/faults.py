@@ -29,6 +29,7 @@ class CameraFaults:
     drop: tuple[int, ...] = ()
     """frames exposed and never delivered"""
     drop_probability: float = field(default=0.0, metadata={"low": 0.0, "high": 1.0})
+    """of each frame to be exposed and never delivered"""
     drop_hides_id: bool = False
     """the device's count shows no gap where a frame was dropped"""
     double: tuple[int, ...] = ()
@@ -40,6 +41,7 @@ class CameraFaults:
     unplug_after: int | None = field(default=None, metadata={"low": 0})
     """DeviceLost after so many frames"""
     times: int = field(default=FOREVER, metadata={"low": 0})
+    """first occurrences of each fault that happen; later ones do not, so that frames taken again are right"""
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ class ProjectorFaults:
     unplug_after: int | None = field(default=None, metadata={"low": 0})
     """DeviceLost after so many flips"""
     times: int = field(default=FOREVER, metadata={"low": 0})
+    """first occurrences of each fault that happen"""
 
 
 @dataclass(frozen=True)

@@ -35,17 +35,25 @@ class Optics:
     """Optics and sensor of both devices; defaults are those of scenes.json."""
 
     full_well_e: float = field(default=15000.0, metadata={"low": 10.0, "high": 1e7})
+    """electrons at full scale and 0 dB: fewer make more shot noise"""
     read_noise_dn: float = field(default=0.8, metadata={"low": 0.0, "high": 100.0})
-    """at 8 bits and 0 dB"""
+    """1-sigma, grey levels at 8 bits and 0 dB"""
     bits: int = field(default=8, metadata={"low": 8, "high": 16})
+    """of the camera's pixels"""
     projector_blur_sigma_px: float = field(default=0.7, metadata={"low": 0.3, "high": 50.0})
+    """of its normal blur, projector px"""
     camera_blur_sigma_px: float = field(default=0.7, metadata={"low": 0.0, "high": 20.0})
+    """of its normal blur, camera px"""
     gamma: float = field(default=2.3, metadata={"low": 0.1, "high": 10.0})
+    """of the projector: its light is (grey level / 255) ^ gamma; another than `precorrection` is a response that nobody
+    corrects"""
     precorrection: float = field(default=2.3, metadata={"low": 0.1, "high": 10.0})
     """the gamma that the rig's calibration believes in"""
     ambient: float = field(default=0.04, metadata={"low": 0.0, "high": 10.0})
     """share of the projector's full light at the aim point, from everywhere"""
     exposure_scale: float = field(default=1.0, metadata={"low": 0.0, "high": 100.0})
+    """times the light that reaches the sensor: at 1 and the default exposure, 99 % of a board in full light stay below
+    230 of 255"""
     projector_falloff: float = field(default=2.0, metadata={"low": 0.0, "high": 8.0})
     """exponent p: the projected picture darkens off its axis as cos^p"""
     vignetting: float = field(default=2.0, metadata={"low": 0.0, "high": 8.0})

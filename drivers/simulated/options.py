@@ -49,12 +49,15 @@ class CameraOptions:
     """The simulated camera's make."""
 
     shutter: str = field(default="global", metadata={"choices": ("global", "rolling")})
+    """rolling: rows begin one after the other, over `readout_us`"""
     readout_us: float = field(default=5000.0, metadata={"low": 10.0, "high": 1e6})
+    """duration of a frame's readout"""
     min_gap_us: float | None = field(default=None, metadata={"low": 0.0, "high": 1e6})
-    """end of one exposure to the start of the next; None: readout_us (a frame that is there leaves an idle camera)"""
+    """end of one exposure to the start of the next; none: `readout_us` (a frame that is there leaves an idle camera)"""
     trigger_latency_us: float = field(default=40.0, metadata={"low": 1.0, "high": 1e5})
     """declared as this +- 25 %; the true one varies within"""
     counts_triggers: bool = True
+    """frames carry the number of the trigger that started them"""
     line: str = field(default="trigger", metadata={"choices": ("trigger", "frame", "exposure")})
     """what is wired to the camera's line: the trigger board, or an output of the projector"""
     line_latency_us: float = field(default=8.0, metadata={"low": 0.0, "high": 1e5})
@@ -66,7 +69,7 @@ class CameraOptions:
     ring: int = field(default=0, metadata={"low": 0, "high": 4096})
     """frames rendered beforehand and handed out in turn, for tests of rate; 0: every frame is rendered"""
     period_us: float | None = field(default=None, metadata={"low": 0.0, "high": 1e8})
-    """FREE: time between frames; with `ring`, 0 gives them as fast as asked. None: the shortest possible"""
+    """FREE: time between frames; with `ring`, 0 gives them as fast as asked; none: the shortest possible"""
 
     @property
     def readout_ns(self) -> int:
@@ -96,13 +99,16 @@ class ProjectorOptions:
     """The simulated projector's make."""
 
     kind: str = field(default="framebuffer", metadata={"choices": ("framebuffer", "static", "sequencer")})
+    """framebuffer: shows what it is given at a refresh; static: one image; sequencer: plays images from its memory"""
     scan: str = field(default="global", metadata={"choices": ("global", "rows")})
     """rows: a new image sweeps down over one refresh, as on an LCD"""
     modulation: str = field(default="declared", metadata={"choices": ("declared", "pwm", "none")})
     """declared: a modulation period is declared and the light is constant; pwm: a grey is built over the period;
     none: constant light, none declared (always so with scan=rows)"""
     refresh_ns: int = field(default=16_666_667, metadata={"low": 1_000_000, "high": 10**9})
+    """period of its refreshes"""
     latency_us: float = field(default=4200.0, metadata={"low": 0.0, "high": 1e6})
+    """from a flip to its light"""
     latency_spread_us: float = field(default=200.0, metadata={"low": 0.0, "high": 1e5})
     """the declared interval is latency_us +- this; the true latency lies in it, with some jitter"""
     settle_us: float = field(default=200.0, metadata={"low": 0.0, "high": 1e6})
@@ -159,6 +165,11 @@ _SIDES: Mapping[str, tuple[type[Any], ...]] = {
     "projector": (ProjectorOptions, ProjectorFaults),
     "trigger": (TriggerOptions, TriggerFaults),
 }
+
+
+def option_kinds() -> dict[str, tuple[type[Any], ...]]:
+    """The tables of options, by whose they are."""
+    return {"World": _WORLD, **{side.capitalize(): kinds for side, kinds in _SIDES.items()}}
 
 
 def read_settings(device: str, options: Mapping[str, Any], side: Side) -> Settings:

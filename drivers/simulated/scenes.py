@@ -44,10 +44,13 @@ class SceneOptions:
     """What a scene can be asked: tilt and place of `tilt`, the number of a printed target's pose."""
 
     tilt_deg: float = field(default=30.0, metadata={"low": -60.0, "high": 60.0})
+    """of the board of `tilt`, degrees"""
     about: str = field(default="x", metadata={"choices": ("x", "y")})
+    """axis of the camera's picture about which it is turned"""
     offset_mm: float = field(default=0.0, metadata={"low": -400.0, "high": 400.0})
     """of the board of `tilt`: farther than the aim by this, in the scene's mm (casey2011's)"""
     pose: int = field(default=0, metadata={"low": 0, "high": 11})
+    """number of a printed target's pose, drawn from `seed`"""
 
 
 def scene_names() -> tuple[str, ...]:

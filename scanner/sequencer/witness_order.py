@@ -92,7 +92,9 @@ def order_witnesses(
     try:
         ladder = plan_ladder(pattern.frequencies, [2 / n for n in pattern.shifts])
     except DecodeError:
-        cannot.append(f"rotations of sets along {axis} (frequencies without a common period)")
+        several = len(pattern.frequencies) > 1
+        why = "frequencies without a common period" if several else "one frequency; decoding compares it with its code"
+        cannot.append(f"rotations of sets along {axis} ({why})")
         return []
     cycles = np.stack([fit.cycles[use].astype(np.float64) for fit in fits])
     centre = 0.5 + (pattern.origin - 0.5) / scene.sequence.projector.along(axis)
