@@ -13,6 +13,7 @@ from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
 
+from scanner.decode.unwrapping import plan_ladder
 from scanner.errors import ConfigError, DecodeError
 from scanner.patterns import (
     Axis,
@@ -70,7 +71,7 @@ def pattern_for(
 
     Raises:
         ConfigError: unknown method.
-        DecodeError: a member is wrong.
+        DecodeError: a member is wrong, or frequencies that nothing can unwrap.
     """
     if method not in METHODS:
         raise ConfigError(f"unknown method {method!r}", hint=f"methods: {', '.join(METHODS)}")
@@ -87,7 +88,11 @@ def pattern_for(
     described = {**default.describe(), **given}
     if method == "pmp" and frequencies and "shifts" not in given:
         described["shifts"] = [8] * len(frequencies)
-    return pattern_from_description(described)
+    pattern = pattern_from_description(described)
+    if method == "pmp" and isinstance(pattern, PmpPattern):
+        # What no decoder can unwrap is refused before it is captured.
+        plan_ladder(pattern.frequencies, [2 / n for n in pattern.shifts])
+    return pattern
 
 
 _OF_SEQUENCES = frozenset({"method", "white", "black", "sentinels", "bars", "precorrection"})

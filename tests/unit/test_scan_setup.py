@@ -107,3 +107,10 @@ def test_a_description_may_be_given_back_as_it_was_written() -> None:
         pattern = pattern_for(method, {}, "y", projector)
         sequence = PatternSequence.bracketed(projector, pattern)
         assert pattern_for(method, sequence.describe(), "y", projector) == pattern
+
+
+@pytest.mark.parametrize("frequencies", [[8.0, 64.0], [6.0]])
+def test_fringes_that_nothing_can_unwrap_are_refused_before_a_frame_is_taken(frequencies: list[float]) -> None:
+    with pytest.raises(DecodeError, match="do not tell one end of the projector from the other"):
+        pattern_for("pmp", {"frequencies": frequencies}, "y", ProjectorSize(1152, 864))
+    assert pattern_for("pmp", {"frequencies": [59.0, 64.0, 70.0]}, "y", ProjectorSize(1152, 864)).fringe_count == 24
