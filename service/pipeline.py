@@ -317,6 +317,7 @@ class Pipeline:
                 f"the daemon was restarted while this scan was {job.state}{how}",
                 hint="ask for the scan again with a new job id",
             )
+            await self._keep_frames(job)
             await self.end(job, JobState.FAILED, reason="daemon_restarted", error=error)
             return
         job.state = JobState.ACQUIRED

@@ -87,6 +87,8 @@ def test_daemon_killed_while_it_acquires(daemon: Callable[..., RunningDaemon], t
         assert outcome["error"]["message"]
         header = (tmp_path / "state" / "spool" / job_id / "capture" / "capture.json").read_bytes()
         assert json.loads(header)["state"] == "failed"
+        listed = {entry["name"] for entry in client.result(job_id)["files"]}
+        assert {"capture/capture.json", "capture/frames.npy", "capture/frames.jsonl"} <= listed
         assert client.scan("mcp").xyz is not None
 
 
