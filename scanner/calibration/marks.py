@@ -31,6 +31,8 @@ WINDOW_PX = 60
 """Half width of the window in which a mark is looked for the first time; later three of its radii."""
 GROUND = 2.0
 """Radii around a mark within which its ground's plane is fitted."""
+IN_LINE = 0.05
+"""Of marks' spread along a line: when they are no farther from it, what turns about it moves them by too little."""
 AREA_RATIO = 2.0
 """By which a mark's area in the picture may differ from the reference's."""
 NOTABLE_SHARE = 1e-4
@@ -65,6 +67,15 @@ class Marks:
     plate: Plate | None = None
     calibration: str = ""
 
+    @property
+    def in_line(self) -> bool:
+        """Whether there are no others than marks on a line, about which a rig may turn unseen."""
+        if self.plate is not None:
+            return False
+        places = np.array([mark.xyz for mark in self.points])
+        spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+        return bool(spread[1] < IN_LINE * spread[0])
+
     def as_dict(self) -> dict[str, Any]:
         """The file's content."""
         return {"format": FORMAT, "version": VERSION, "units": "mm", **asdict(self)}
@@ -87,11 +98,11 @@ def reference_marks(
         calibration: id of the scan's.
 
     Raises:
-        DecodeError: a disc or a plate is not there, has no points, or there are too few.
+        DecodeError: a disc or a plate is not there or has no points, a disc is given twice, or there are too few.
     """
     if len(places) < FEWEST_MARKS and region is None:
         raise DecodeError(f"{len(places)} marks are too few: give {FEWEST_MARKS} or more, or a plate")
-    points = []
+    points: list[Mark] = []
     for number, place in enumerate(places, 1):
         found = _disc(albedo, np.array(place, dtype=np.float64), None)
         if found is None:
@@ -106,6 +117,8 @@ def reference_marks(
                 f"the mark at ({centre[0]:.1f}, {centre[1]:.1f}) has no scanned surface around it",
                 hint="half of its ground, twice as wide as the mark, must have points",
             )
+        if any(np.hypot(*np.subtract(other.at, centre)) < radius for other in points):
+            raise DecodeError(f"the disc at ({centre[0]:.1f}, {centre[1]:.1f}) is given twice", hint="give each once")
         points.append(Mark(str(number), _pair(centre), radius, _triple(point)))
     plate = None if region is None else Plate(region, *_plate(xyz, region))
     return Marks(tuple(points), plate, calibration)
@@ -282,8 +295,8 @@ def _judged(marks: Marks, content: Mapping[str, Any]) -> dict[str, Any]:
     if worst > allowed:
         what = "the plate" if offset >= content.get("largest_mm", 0.0) else "a witness mark"
         warning = (
-            f"{what} is off by {worst:.3f} mm ({allowed:.3f} mm are within the noise): the rig, or the mark, has moved "
-            "since the reference was taken"
+            f"{what} is off by {worst:.3f} mm ({allowed:.3f} mm, a ten-thousandth of the distance, are let pass): the "
+            "rig, or the mark, has moved since the reference was taken"
         )
     elif marks.points and not content["seen"] and marks.plate is None:
         warning = "none of the witness marks is seen: nothing vouches for this scan's geometry"

@@ -9,7 +9,7 @@ import typer
 
 from service.commands.calibrate_solve import Replace
 from service.commands.options import AsJson, output_path, require_free
-from service.terminal import print_facts, print_json, progress_lines
+from service.terminal import print_error, print_facts, print_json, progress_lines
 
 
 def marks(
@@ -62,6 +62,12 @@ def marks(
             str((opened.report.get("rig") or {}).get("calibration", "")),
         )
         replace_json(output, found.as_dict())
+    if found.in_line:
+        print_error(
+            "the marks lie on one line: a turn about it moves none of them",
+            "fix one more beside it, or a plate",
+            label="warning",
+        )
     if as_json:
         print_json({"file": str(output), **found.as_dict()})
         return 0

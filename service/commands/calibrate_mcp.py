@@ -15,6 +15,10 @@ from service.terminal import print_error, print_facts, print_json
 if TYPE_CHECKING:
     from scanner.calibration.mcp_phase import McpPhase
 
+_PHASES = ("pmp", "gray+pmp")
+"""Methods whose rows are phases at every pixel: finer than what they are to check."""
+_ORDER = "the first folder is that of a PMP scan, the second that of an MCP scan: fringed scan --method pmp, then mcp"
+
 
 def mcp(
     pmp: Annotated[Path, typer.Argument(metavar="PMP-SCAN", help="A PMP scan of a matt white flat board.")],
@@ -137,9 +141,13 @@ def _both(pmp: Path, single: Path) -> tuple[Any, Any, float, str]:
     from scanner.scan import load_scan  # noqa: PLC0415
 
     dense, stripes = load_scan(pmp), load_scan(single)
+    if stripes.peaks is None:
+        raise DecodeError(f"{single} is no MCP scan", hint=_ORDER)
+    if (dense.report.get("decoder") or {}).get("method") not in _PHASES:
+        raise DecodeError(f"{pmp} is no PMP scan", hint=_ORDER)
     sequence = Capture.open(single / "capture").header.sequence
-    if stripes.peaks is None or not isinstance(sequence.pattern, McpPattern):
-        raise DecodeError(f"{single} is no MCP scan", hint="fringed scan --method mcp")
+    if not isinstance(sequence.pattern, McpPattern):
+        raise DecodeError(f"{single} is no MCP scan", hint=_ORDER)
     axis = sequence.pattern.axis
     rows = dense.rows if axis == "y" else dense.columns
     if rows is None:

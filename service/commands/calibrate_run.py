@@ -145,26 +145,31 @@ def _guided(
 ) -> tuple[Solution, dict[str, Any] | None]:
     """Measure, guide, solve: the rig, and the projector's response where it was told."""
     from scanner.client import Client  # noqa: PLC0415
-    from scanner.errors import ScannerError  # noqa: PLC0415
+    from scanner.errors import CalibrationError, ScannerError  # noqa: PLC0415
     from service.config import is_simulated  # noqa: PLC0415
     from service.guided_calibration import GuidedCalibration  # noqa: PLC0415
     from service.keys import keys  # noqa: PLC0415
 
+    simulated = rig is not None and is_simulated(rig)
     with _daemon(rig, connect) as (endpoint, levels), Client(endpoint, name="fringed calibrate run") as client:
         session = GuidedCalibration(client, target, asked.folder, options)
         try:
             if taken_up := session.take_up():
                 say(f"{taken_up} poses of {asked.folder} are taken up")
+                if simulated:
+                    say(f"a simulated target begins in its first pose again: &pose={taken_up} in its name goes on")
             with keys() as pressed:
                 loop = _Loop(session, asked, pressed, levels)
                 loop.run()
+            if not session.observations and not session.left_out:
+                raise CalibrationError("no pose was captured", hint=f"at the end: {loop.last_line()}")
             with progress_lines() as lines:
                 try:
                     return session.solved(leave_out=True, progress=lines.stage), loop.response
                 except ScannerError:  # else its warnings say so
-                    _say_lacking(session.guide, simulated=rig is not None and is_simulated(rig))
+                    _say_lacking(session.guide, simulated=simulated)
                     raise
-        except (KeyboardInterrupt, ScannerError):
+        except (KeyboardInterrupt, SystemExit, ScannerError):
             if session.observations:
                 say(f"the poses are kept: the same command with -o {asked.folder} goes on with them")
             raise
@@ -257,11 +262,11 @@ class _Loop:
         """Whether no new pose came for long; what it waits for is said now and then: nobody sees a drawn line."""
         waits_s = time.monotonic() - self._progress_s
         if waits_s > PATIENCE_S:
-            say(f"no new pose for {PATIENCE_S:.0f} s: {self._last_line()}")
+            say(f"no new pose for {PATIENCE_S:.0f} s: {self.last_line()}")
             return True
         if waits_s > self._said_after_s:
             self._said_after_s += SAID_EVERY_S
-            say(f"no new pose for {waits_s:.0f} s (ends after {PATIENCE_S:.0f}): {self._last_line()}")
+            say(f"no new pose for {waits_s:.0f} s (ends after {PATIENCE_S:.0f}): {self.last_line()}")
         return False
 
     def _look(self) -> bool:
@@ -316,8 +321,10 @@ class _Loop:
             say("next: as before" if advice == self._advice else f"next: {advice}")
             self._advice = advice
 
-    def _last_line(self) -> str:
-        return self._seen if isinstance(self._seen, str) else self._seen.trouble or "the target stands as before"
+    def last_line(self) -> str:
+        """What keeps the pose that is seen now from being captured."""
+        usual = "the target stands as before" if self._session.observations else "Enter captures"
+        return self._seen if isinstance(self._seen, str) else self._seen.trouble or usual
 
     def _draw(self, pixels: Any, line: str) -> None:
         from scanner.calibration.guide_picture import guide_picture  # noqa: PLC0415

@@ -1,6 +1,7 @@
 """`fringed calibrate run` as a whole: a target that walks through its poses, captured by itself, to a calibration."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,19 @@ def test_a_rig_is_calibrated_by_itself(rig: Path, tmp_path: Path, capsys: pytest
     assert again.undo() == f"{POSES:02d}"
     assert len(again.captures) == POSES - 1
     again.close()
+
+
+@pytest.mark.usefixtures("quick")
+def test_where_no_pose_is_captured_the_reason_is_said(
+    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.commands.calibrate_run.PATIENCE_S", 0.5)
+    assert main(["calibrate", "run", str(rig), "--target", "circles:7x5:19", "-o", str(tmp_path / "none")]) == 1
+    said = capsys.readouterr().err
+    assert "error: no pose was captured" in said
+    waited = re.search(r"no new pose for \d+ s: (.+)", said)
+    assert waited is not None
+    assert f"hint: at the end: {waited[1]}" in said
 
 
 @pytest.mark.parametrize(

@@ -99,6 +99,17 @@ def test_what_is_no_mark_is_refused() -> None:
         reference_marks(albedo, np.full_like(xyz, np.nan), PLACES)
     with pytest.raises(DecodeError, match="outside the picture"):
         reference_marks(albedo, xyz, PLACES, (900, 900, 10, 10))
+    with pytest.raises(DecodeError, match=r"the disc at \(60\.0, 60\.0\) is given twice"):
+        reference_marks(albedo, xyz, [*PLACES, (70.0, 60.0)])
+
+
+def test_marks_on_a_line_are_told_and_a_plate_mends_it(marks: Marks) -> None:
+    first, second, third = marks.points
+    between = tuple((np.array(first.xyz) + second.xyz) / 2 + (0, 3, 0))
+    line = Marks((first, second, replace(third, xyz=between)))
+    assert line.in_line
+    assert not replace(line, plate=marks.plate).in_line
+    assert not Marks(marks.points).in_line
 
 
 def test_files_are_read_back_and_bad_ones_refused(marks: Marks, tmp_path: Path) -> None:

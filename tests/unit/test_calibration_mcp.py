@@ -94,8 +94,8 @@ def test_too_few_peaks_are_refused() -> None:
 
 def test_mcp_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows, peaks = stripes(27.0, 13.0)
-    dense = str(save(tmp_path / "pmp", None, rows=rows))
-    single = save(tmp_path / "mcp", None, rows=rows, peaks=peaks)
+    dense = str(save(tmp_path / "pmp", None, method="pmp", rows=rows))
+    single = save(tmp_path / "mcp", None, method="mcp", rows=rows, peaks=peaks)
     sequence = PatternSequence(ProjectorSize(1152, 864), McpPattern(axis="y"))
     header = CaptureHeader(sequence, CameraFormat(300, 400, 8), frames=("0.png",))
     (single / "capture").mkdir()
@@ -122,7 +122,10 @@ def test_mcp_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "verdict    good (at most 0.2 rows of deviation and of scatter, 5% outliers are allowed)" in said.out
     assert "at the stripe where it is largest: to quote" in " ".join(said.out.split())
     assert "differ" not in said.err
-    off = str(save(tmp_path / "off", None, rows=rows + np.float32(0.4)))
+    off = str(save(tmp_path / "off", None, method="pmp", rows=rows + np.float32(0.4)))
     assert main(["calibrate", "mcp", off, str(single)]) == 0
     assert "stripes and PMP rows differ by up to 0.40 rows" in capsys.readouterr().err
     assert main(["calibrate", "mcp", dense, dense]) == 1
+    assert "is no MCP scan" in capsys.readouterr().err
+    assert main(["calibrate", "mcp", str(single), str(single)]) == 1
+    assert "is no PMP scan" in capsys.readouterr().err

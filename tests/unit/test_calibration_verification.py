@@ -287,7 +287,9 @@ def test_a_board_of_half_a_scans_points_is_warned_of(tmp_path: Path) -> None:
 # --- commands -------------------------------------------------------------------------------------------------------
 
 
-def save(folder: Path, xyz: np.ndarray | None, albedo: np.ndarray | None = None, **maps: np.ndarray) -> Path:
+def save(
+    folder: Path, xyz: np.ndarray | None, albedo: np.ndarray | None = None, method: str = "", **maps: np.ndarray
+) -> Path:
     shape = albedo.shape if albedo is not None else xyz.shape[:2] if xyz is not None else maps["rows"].shape
     plain = np.full(shape, 120, np.float32)
     scan = Scan(
@@ -303,7 +305,7 @@ def save(folder: Path, xyz: np.ndarray | None, albedo: np.ndarray | None = None,
         reason=np.zeros(shape, np.uint8),
         stripes=None,
         peaks=maps.get("peaks"),
-        report={"format": "fringed-report", "version": 1},
+        report={"format": "fringed-report", "version": 1, **({"decoder": {"method": method}} if method else {})},
     )
     folder.mkdir()
     np.savez(folder / "scan.npz", **scan.arrays())  # what `verify` reads; no cloud and no picture
