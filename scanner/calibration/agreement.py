@@ -58,18 +58,15 @@ class Agreed:
 
     @property
     def left_px(self) -> float:
-        """Root mean square of what is left in both pictures, px, over the points that took part."""
-        return float(np.sqrt(np.mean([np.square(part).mean() for part in _kept_residuals(self.adjusted)])))
+        """Root mean square of what is left in both pictures, px, of all views."""
+        camera, projector = _view_rms(self.problem, self.adjusted, kept=True)
+        points = np.array([kept.sum() for kept in self.adjusted.kept])
+        return float(np.sqrt(np.average(np.square((camera, projector)).mean(axis=0), weights=points)))
 
     @property
     def worst_px(self) -> float:
-        """That of the view with the largest."""
-        sides = self.adjusted.camera_residuals, self.adjusted.projector_residuals
-        return max(
-            float(np.sqrt((part[kept] ** 2).sum(axis=1).mean()))
-            for side in sides
-            for part, kept in zip(side, self.adjusted.kept, strict=True)
-        )
+        """That of the view with the largest, in one picture."""
+        return float(np.max(_view_rms(self.problem, self.adjusted, kept=True)))
 
 
 def agreed(problem: Problem, *, leave_out: bool = True) -> Agreed:
@@ -105,7 +102,7 @@ def _without_bad_views(problem: Problem) -> Agreed:
     state = begun.state
     while True:
         corrected, adjusted = _adjusted(seen, state)
-        worst = _worst_view(adjusted) if problem.target.flat else None
+        worst = _worst_view(corrected, adjusted) if problem.target.flat else None
         if worst is None or len(seen.views) <= FEWEST_VIEWS:
             return Agreed(corrected, adjusted, tuple(out))
         k, why = worst
@@ -252,10 +249,9 @@ def _centred(problem: Problem, state: State, k: int) -> View:
     return replace(view, camera=view.camera - moved, projector=view.projector - (view.slope @ moved[..., None])[..., 0])
 
 
-def _worst_view(adjusted: Adjusted) -> tuple[int, str] | None:
+def _worst_view(problem: Problem, adjusted: Adjusted) -> tuple[int, str] | None:
     found = None
-    for side, residuals in (("camera", adjusted.camera_residuals), ("projector", adjusted.projector_residuals)):
-        rms = _view_rms(residuals)
+    for side, rms in zip(("camera", "projector"), _view_rms(problem, adjusted, kept=False), strict=True):
         k = int(np.argmax(rms))
         others = float(np.median(np.delete(rms, k))) if len(rms) > 1 else rms[k]
         over = rms[k] / max(BAD_VIEW * others, BAD_VIEW_PX)
@@ -268,12 +264,13 @@ def _worst_view(adjusted: Adjusted) -> tuple[int, str] | None:
     return found and found[:2]
 
 
-def _view_rms(residuals: Sequence[Array]) -> Array:
-    return np.array([np.sqrt((r**2).sum(axis=1).mean()) for r in residuals])
-
-
-def _kept_residuals(adjusted: Adjusted) -> list[Array]:
-    """(N,) px of the points that took part: distances in the camera, and in the projector."""
-    kept = np.concatenate(adjusted.kept)
+def _view_rms(problem: Problem, adjusted: Adjusted, *, kept: bool) -> tuple[Array, Array]:
+    """(V,) px left in the camera and (V,) in the projector, whose points are weighed by their sigmas
+    (`Problem.typical_rms`). kept: of the points that took part alone."""
+    camera, projector = [], []
     sides = adjusted.camera_residuals, adjusted.projector_residuals
-    return [np.linalg.norm(np.concatenate(side)[kept], axis=1) for side in sides]
+    for view, seen, predicted, took_part in zip(problem.views, *sides, adjusted.kept, strict=True):
+        part = took_part if kept else np.ones_like(took_part)
+        camera.append(np.sqrt(np.square(seen[part]).sum(axis=1).mean()))
+        projector.append(problem.typical_rms(view.only(part), predicted[part]))
+    return np.array(camera), np.array(projector)

@@ -31,12 +31,14 @@ FEWEST_FOR_SPREAD = 5
 class HeldOut:
     """What leaving views out says.
 
-    errors: (V,) px rms in the projector of each view, predicted by the others; NaN where not tried. within: (V,) the
-    same by the rig that all of them made. covariance: (27, 27) as the adjustment's, widened to how much the rig moves
-    from view to view. widened: by how many times all sigmas were.
+    errors: (V,) px rms in the projector of each view, predicted by the others; NaN where not tried. misses: (V,) the
+    same with points weighed by their sigmas (`Problem.typical_rms`). within: (V,) such figures by the rig that all of
+    them made. covariance: (27, 27) as the adjustment's, widened to how much the rig moves from view to view. widened:
+    by how many times all sigmas were.
     """
 
     errors: Array
+    misses: Array
     within: Array
     covariance: Array
     widened: float = 1.0
@@ -45,21 +47,21 @@ class HeldOut:
     def nothing(cls, adjusted: Adjusted) -> HeldOut:
         """Of views that are not left out in turn."""
         unknown = np.full(len(adjusted.kept), np.nan)
-        return cls(unknown, unknown, adjusted.covariance)
+        return cls(unknown, unknown, unknown, adjusted.covariance)
 
     @property
     def most(self) -> int | None:
         """The view that the others predict worst; None where none was tried."""
-        return int(np.nanargmax(self.errors)) if np.isfinite(self.errors).any() else None
+        return int(np.nanargmax(self.misses)) if np.isfinite(self.misses).any() else None
 
     @property
     def most_px(self) -> float:
-        """px by which they miss it; NaN where none was tried."""
-        return float("nan") if self.most is None else float(self.errors[self.most])
+        """px by which they miss it, its points weighed; NaN where none was tried."""
+        return float("nan") if self.most is None else float(self.misses[self.most])
 
     @property
     def typical_px(self) -> float:
-        """px that the rig of all views leaves of one, their median."""
+        """px that the rig of all views leaves of one, points weighed, their median."""
         return float(np.median(self.within))
 
 
@@ -74,7 +76,7 @@ def hold_out(problem: Problem, adjusted: Adjusted) -> HeldOut:
     if count <= FEWEST_LEFT or not problem.target.flat:
         return HeldOut.nothing(adjusted)
     within = np.array([prediction(problem, adjusted.state, view)[1] for view in views])
-    errors = np.full(count, np.nan)
+    errors, misses = np.full(count, np.nan), np.full(count, np.nan)
     tried = np.unique(np.linspace(0, count - 1, min(count, MOST_TRIED)).round().astype(int))
     moved, looser = [], []
     for k in tried:
@@ -82,12 +84,13 @@ def hold_out(problem: Problem, adjusted: Adjusted) -> HeldOut:
         part = replace(problem, views=tuple(views[i] for i in rest))
         begun = replace(adjusted.state, poses=adjusted.state.poses[rest])
         others, covariance = adjust_again(part, begun, (adjusted.sigma_camera, adjusted.projector_factor))
-        errors[k] = prediction(problem, others, views[k])[1]
+        if (off := _missed(problem, others, views[k])) is not None:
+            errors[k], misses[k] = _rms(off[1]), problem.typical_rms(views[k], off[1])
         moved.append(others.vector()[:POSES] - adjusted.state.vector()[:POSES])
         looser.append(covariance - adjusted.covariance)
     if count < FEWEST_FOR_SPREAD:
-        return HeldOut(errors, within, adjusted.covariance)
-    return HeldOut(errors, within, *_widened(adjusted.covariance, np.array(moved), np.array(looser), count))
+        return HeldOut(errors, misses, within, adjusted.covariance)
+    return HeldOut(errors, misses, within, *_widened(adjusted.covariance, np.array(moved), np.array(looser), count))
 
 
 def _widened(formal: Array, moved: Array, looser: Array, count: int) -> tuple[Array, float]:
@@ -127,8 +130,17 @@ def _widened(formal: Array, moved: Array, looser: Array, count: int) -> tuple[Ar
 def prediction(problem: Problem, state: State, view: View) -> tuple[float, float]:
     """(camera, projector) px rms of a view that the rig has not seen, its pose from its camera points alone.
 
-    NaN, NaN where no pose fits.
+    The projector's points are weighed by their sigmas: in a view that is overexposed in part some are known to a tenth
+    of a pixel only. NaN, NaN where no pose fits.
     """
+    missed = _missed(problem, state, view)
+    if missed is None:
+        return float("nan"), float("nan")
+    return _rms(missed[0]), problem.typical_rms(view, missed[1])
+
+
+def _missed(problem: Problem, state: State, view: View) -> tuple[Array, Array] | None:
+    """(N, 2) px in the camera, and in the projector; None where no pose fits."""
     sheet, _ = sheet_points(problem.target, state.sheet)
     points = sheet[view.ids]
     camera = state.camera
@@ -136,13 +148,12 @@ def prediction(problem: Problem, state: State, view: View) -> tuple[float, float
         points, view.camera, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_ITERATIVE
     )
     if not found:
-        return float("nan"), float("nan")
+        return None
     in_camera = points @ rotation_of(np.ravel(turn)).T + np.ravel(shift)
     seen = state.projector.project(in_camera @ state.rotation.T + state.translation)
-    missed = camera.project(in_camera) - view.camera
+    missed: Array = camera.project(in_camera) - view.camera
     # An error of the camera's point moves the projector's reading with it: that part is no error of the rig.
-    off = seen - view.projector - (view.slope @ missed[..., None])[..., 0]
-    return _rms(missed), _rms(off)
+    return missed, seen - view.projector - (view.slope @ missed[..., None])[..., 0]
 
 
 def _rms(off: Array) -> float:

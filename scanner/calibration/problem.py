@@ -7,6 +7,7 @@ from camera to projector, the target's sheet (scale x, scale y, bow), then six n
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +106,16 @@ class Problem:
     priors: Priors = field(default_factory=Priors)
     length: Length | None = None
     fixed: tuple[int, ...] = ()
+
+    @cached_property
+    def typical_sigma(self) -> float:
+        """The median of the views' sigmas, px."""
+        return float(np.median(np.concatenate([view.sigma.ravel() for view in self.views])))
+
+    def typical_rms(self, view: View, off: Array) -> float:
+        """px rms of distances in the projector, (N, 2), weighed by their sigmas: what they would be if all points of
+        all views were as sharp as the median one."""
+        return float(np.sqrt(np.square(off * (self.typical_sigma / view.sigma)).sum(axis=1).mean()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -82,6 +82,22 @@ def test_a_view_that_bends_the_rig_too_little_to_be_left_out_is_warned_of_and_wi
     assert sigmas_off(clean) < 3
 
 
+def test_a_view_of_which_a_part_is_noisy_contradicts_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one that is overexposed in part: its sigmas say so, and nobody is asked who agrees with whom."""
+    every = moved_between_axes(8, (), 0.0, 2)
+    view = every[3].view
+    blunt = np.where(np.arange(len(view.ids))[:, None] % 2 == 0, 30.0, 1.0)
+    noise = np.random.default_rng(0).normal(0, view.sigma) * np.sqrt(blunt**2 - 1)
+    noisy = replace(view, projector=view.projector + noise, sigma=blunt * view.sigma)
+    every[3] = replace(every[3], view=noisy)
+    monkeypatch.setattr("scanner.calibration.agreement._searched", lambda *_, **__: pytest.fail("it was doubted"))
+    found = solve(SMALL, every, LENGTH)
+    assert found.left_out == ()
+    assert not any("contradict each other" in warning for warning in found.warnings)
+    assert np.nanargmax(found.held_out.errors) == 3
+    assert sigmas_off(found) < 3
+
+
 def test_without_a_majority_the_refusal_says_so() -> None:
     every = spoilt(4, {0: ("projector", 40.0), 1: ("projector", -60.0), 2: ("camera", 90.0)}, seed=1)
     with pytest.raises(CalibrationError, match=r"no majority of the 4 views agrees|most in pose0") as refused:
