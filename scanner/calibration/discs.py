@@ -36,6 +36,8 @@ MOST_BLOBS = 45
 NEAR_SHARE = 0.35
 """Of the discs' distance: how near a blob must lie to where an affine picture has it. A wedge of a fifth of its width
 in depth is off by a tenth."""
+LEAST_BREADTH = 0.01
+"""Of a target in space, seen from its discs' front, to its length: less is a line, which no affine picture explains."""
 LEAST_DISC_SHARE = 0.6
 
 
@@ -69,6 +71,9 @@ def detect_discs(picture: NDArray[np.float32], grey: NDArray[np.uint8], target: 
     Of several such pictures (a target that looks the same upside down) the most upright one is taken.
     """
     flat = _seen_from_the_front(target)
+    spread = np.linalg.svd(flat, compute_uv=False)
+    if spread[1] < LEAST_BREADTH * spread[0]:
+        return "the target's discs lie on one line, as seen from their front: put them right in its file"
     best: tuple[int, float, Array] = (0, 0.0, np.zeros((2, 3)))
     for shown in (grey, 255 - grey):
         blobs = np.array([k.pt for k in _blobs(grey.shape).detect(shown)], dtype=np.float64).reshape(-1, 2)

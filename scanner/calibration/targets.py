@@ -139,8 +139,11 @@ def load_discs(path: Path) -> Target:
     diameter = content.get("diameter_mm", 0.0)
     if not isinstance(diameter, int | float) or not 0 < diameter < 1e4:
         raise ConfigError(f"target {path}: diameter_mm must be a length in mm, got {diameter!r}")
-    near = np.linalg.norm(points[:, None] - points[None], axis=-1)
-    spacing = float(np.median(np.sort(near, axis=1)[:, 1]))
+    near = np.linalg.norm(points[:, None] - points[None], axis=-1) + np.diag(np.full(len(points), np.inf))
+    first, second = np.divmod(int(near.argmin()), len(points))
+    if near[first, second] < diameter / 2:
+        raise ConfigError(f"target {path}: points {first} and {second}, from 0 on, are the same disc")
+    spacing = float(np.median(near.min(axis=1)))
     return Target(f"wedge:{path}", "wedge", len(points), 1, spacing, points, float(diameter), turned)
 
 

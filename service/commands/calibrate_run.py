@@ -323,8 +323,8 @@ class _Loop:
 
     def last_line(self) -> str:
         """What keeps the pose that is seen now from being captured."""
-        usual = "the target stands as before" if self._session.observations else "Enter captures"
-        return self._seen if isinstance(self._seen, str) else self._seen.trouble or usual
+        seen = "the target stands as before" if self._session.observations else "the target is seen: Enter captures"
+        return self._seen if isinstance(self._seen, str) else self._seen.trouble or seen
 
     def _draw(self, pixels: Any, line: str) -> None:
         from scanner.calibration.guide_picture import guide_picture  # noqa: PLC0415

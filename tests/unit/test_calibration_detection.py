@@ -204,6 +204,19 @@ def test_targets_that_are_none(spec: str, words: str) -> None:
         parse_target(spec)
 
 
+DISCS = {"format": "fringed-target", "version": 1, "diameter_mm": 14}
+
+
+@pytest.mark.parametrize("depth", [0.0, 1.0])
+def test_discs_on_a_line_are_refused(depth: float, tmp_path: Path) -> None:
+    """In space, or as seen from the front: of a plane that is seen edge on."""
+    points = [[20 * k, 0, depth * k * k] for k in range(12)]
+    (tmp_path / "line.json").write_text(json.dumps({**DISCS, "points": points}))
+    found = detect(drawn_discs(wedge(tmp_path)), parse_target(f"wedge:{tmp_path / 'line.json'}"))
+    assert isinstance(found, NotFound)
+    assert "lie on one line" in found.reason
+
+
 def test_target_files_that_are_none(tmp_path: Path) -> None:
     file = tmp_path / "wedge.json"
     for content, words in (
@@ -211,6 +224,7 @@ def test_target_files_that_are_none(tmp_path: Path) -> None:
         ('{"format": "x"}', "no fringed-target"),
         ('{"format": "fringed-target", "version": 1, "points": [[1, 2, 3]], "diameter_mm": 5}', "needs 12"),
         ('{"format": "fringed-target", "version": 1, "points": [[1, 2]]}', "list of"),
+        (json.dumps({**DISCS, "points": [[20 * k, k * k, 0] for k in range(12)] + [[42, 4, 0]]}), "points 2 and 12"),
     ):
         file.write_text(content)
         with pytest.raises(ConfigError, match=words) as refused:
