@@ -1,6 +1,7 @@
 """How right a rig's calibration is, on the simulated rigs and on real corners.
 
-    python bench/calibration.py poses [--seeds 3] [--rigs casey2011,bench2026] [--targets charuco,chessboard]
+    python bench/calibration.py poses [--seeds 3] [--rigs casey2011,bench2026]
+                                       [--targets charuco,chessboard,circles,acircles]
     python bench/calibration.py planes [--seeds 1] [--rig casey2011]
     python bench/calibration.py sphere [--seeds 1] [--rig casey2011]
     python bench/calibration.py wedge [--seeds 1] [--rig casey2011]
@@ -52,7 +53,12 @@ from scanner.patterns import CameraFormat, McpPattern, PatternSequence, PmpPatte
 from scanner.patterns.sequence import Precorrection
 from scanner.triangulation import triangulate
 
-SPECS = {"charuco": "charuco:10x7:30", "chessboard": "chessboard:9x6:30"}
+SPECS = {
+    "charuco": "charuco:10x7:30",
+    "chessboard": "chessboard:9x6:30",
+    "circles": "circles:8x5:30:15",
+    "acircles": "acircles:5x7:22.5:18",
+}
 POSES = 12
 BOTH_AXES = PmpPattern(axes=("x", "y"), frequencies=(1.0, 8.0, 64.0), shifts=(8, 8, 8))
 LENGTH_SIGMA_MM = 0.01

@@ -60,8 +60,14 @@ def _wedge(rig: Rig) -> dict[str, Any]:
 
 
 def _target(rig: Rig, name: str) -> dict[str, Any]:
-    """Its name, its squares, and the longest row: from the first to the last inner corner."""
+    """Its name, its squares or discs, and the longest row: from the first to the last corner or centre."""
     board, square = targets.POSED[name], targets.square_mm(rig)
+    if isinstance(board, targets.DiscTarget):
+        spacing, diameter = board.spacing * square, board.diameter * square
+        kind = "acircles" if board.staggered else "circles"
+        longest = (board.columns - 1) * (2 if board.staggered else 1) * spacing
+        spec = f"{kind}:{board.columns}x{board.rows}:{spacing:g}:{diameter:g}"
+        return {"target": spec, "spacing_mm": spacing, "diameter_mm": diameter, "longest_row_mm": longest}
     kind = "charuco" if board.charuco else "chessboard"
     columns, rows = (board.columns, board.rows) if board.charuco else (board.columns - 1, board.rows - 1)
     marker = {"marker_mm": 0.75 * square} if board.charuco else {}

@@ -55,7 +55,7 @@ class SceneOptions:
 
 def scene_names() -> tuple[str, ...]:
     """Names of all scenes, tilted boards spelt out."""
-    return (*reference()["scenes"], *_TILTS)
+    return (*reference()["scenes"], *targets.DISC_POSES, *_TILTS)
 
 
 def build_scene(name: str, options: SceneOptions, rig: Rig, seed: int) -> Scene:

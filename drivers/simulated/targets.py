@@ -66,6 +66,42 @@ class PrintedTarget:
         return textures.Picture(picture, square_mm / CELLS_PER_SQUARE, around=self.white)
 
 
+@dataclass(frozen=True)
+class DiscTarget:
+    """A grid of dark discs, in a frame as `PrintedTarget` has it. Lengths in squares of those, on paper as large.
+
+    staggered: discs of a row are two spacings apart, and odd rows one to the right (OpenCV's asymmetric grid).
+    """
+
+    columns: int
+    rows: int
+    spacing: float
+    diameter: float
+    staggered: bool
+    paper: tuple[int, int]
+    dark: float
+    white: float
+
+    @property
+    def half_extent_squares(self) -> tuple[float, float]:
+        """Half width and height of the paper, squares."""
+        return self.paper[0] / 2 + MARGIN_SQUARES, self.paper[1] / 2 + MARGIN_SQUARES
+
+    def points(self, square_mm: float) -> Array:
+        """(columns rows, 3) mm: the discs' centres, row by row from the top left."""
+        y, x = np.mgrid[: self.rows, : self.columns].astype(np.float64)
+        if self.staggered:
+            x = 2 * x + y % 2
+        x, y = (each - each.max() / 2 for each in (x, y))
+        centres = np.stack((x, y, np.zeros_like(x)), axis=-1).reshape(-1, 3)
+        return np.asarray(centres * self.spacing * square_mm, dtype=np.float64)
+
+    def texture(self, square_mm: float) -> textures.Discs:
+        """Albedo over the paper; square_mm: side of a square in the texture's own coordinates."""
+        centres = np.ascontiguousarray(self.points(square_mm)[:, :2])
+        return textures.Discs(centres, self.diameter * square_mm / 2, self.dark, self.white)
+
+
 @dataclass(frozen=True, eq=False)
 class WedgePlane:
     """One side of the wedge, coordinates of scenes.json: centre, unit axes, half extents, discs in (u, v) mm."""
@@ -78,11 +114,15 @@ class WedgePlane:
     """(9, 2)"""
 
 
-POSED = {
+POSED: dict[str, PrintedTarget | DiscTarget] = {
     "charuco_poses": PrintedTarget(10, 7, charuco=True, dark=0.05, white=0.85),
     "chessboard_poses": PrintedTarget(10, 7, charuco=False, dark=0.35, white=0.85),
+    "circles_poses": DiscTarget(8, 5, 1.0, 0.5, False, (10, 7), dark=0.05, white=0.85),
+    "acircles_poses": DiscTarget(5, 7, 0.75, 0.6, True, (10, 7), dark=0.05, white=0.85),
 }
 """Scenes that show a printed target in one of twelve poses"""
+DISC_POSES = tuple(name for name, target in POSED.items() if isinstance(target, DiscTarget))
+"""Those that scenes.json has not: their poses are drawn as those of a chessboard are"""
 
 
 def charuco_board() -> cv2.aruco.CharucoBoard:
@@ -100,7 +140,7 @@ def square_mm(rig: Rig) -> float:
 
 
 def target_points(scene: str, rig: Rig) -> Array:
-    """(54, 3) mm, target frame: inner corners of the target of `charuco_poses` or `chessboard_poses`."""
+    """(N, 3) mm, target frame: inner corners of a board's squares, or centres of discs."""
     return POSED[scene].points(square_mm(rig))
 
 
@@ -109,7 +149,8 @@ def target_poses(scene: str, rig: Rig, seed: int) -> tuple[Pose, ...]:
 
     Tilts up to the scene's `tilt_deg` about any axis in the board, turns up to 15 degrees, depths over its range.
     """
-    description = reference()["scenes"][scene]
+    scenes = reference()["scenes"]
+    description = scenes.get(scene, scenes["chessboard_poses"])
     generator = np.random.default_rng([seed, len(scene)])
     near, far = description["depth_mm"]
     count = int(description["poses"])
@@ -155,7 +196,7 @@ def _drawn_pose(generator: np.random.Generator, rig: Rig, depth: float, tilt: fl
     return Pose(np.asarray(tilted @ turned, dtype=np.float64), rig.from_scene(where))
 
 
-def _in_view(pose: Pose, target: PrintedTarget, rig: Rig) -> bool:
+def _in_view(pose: Pose, target: PrintedTarget | DiscTarget, rig: Rig) -> bool:
     """Whether the paper's corners lie in both devices' pictures, 1 % off their edges."""
     half = np.asarray(target.half_extent_squares) * square_mm(rig)
     signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])

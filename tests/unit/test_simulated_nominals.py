@@ -50,7 +50,9 @@ def test_targets_are_named_as_a_calibration_names_them() -> None:
             target = parse_target(told["target"])
             assert target.longest_mm == pytest.approx(told["longest_row_mm"])
             points = targets.target_points(scene, rig(name))
-            assert np.ptp(points[:, 0]) == pytest.approx(told["longest_row_mm"])
+            assert target.points == pytest.approx(points)
+            first_row = points[points[:, 1] == points[0, 1]]
+            assert np.ptp(first_row[:, 0]) == pytest.approx(told["longest_row_mm"])
 
 
 def rows() -> list[str]:
