@@ -16,7 +16,10 @@ FRAME_EVENT_S = 0.05
 
 
 class ScanHearing:
-    """Hears of one scan on the devices (`service.devices_link.ScanListener`)."""
+    """Hears of one scan on the devices (`service.devices_link.ScanListener`).
+
+    They may still speak of one that is over, cancelled meanwhile: of that nothing is told and nothing begins any more.
+    """
 
     def __init__(self, pipeline: Pipeline, job: Job) -> None:
         self._pipeline = pipeline
@@ -25,14 +28,18 @@ class ScanHearing:
 
     async def need(self, need: Need) -> None:
         """It is planned. Raises StorageError where the spool has no room."""
-        await self._pipeline.room_for(self._job, need)
+        if not self._job.state.over:
+            await self._pipeline.room_for(self._job, need)
 
     def began(self) -> None:
         """Its capture folder is there."""
-        self._pipeline.began(self._job)
+        if not self._job.state.over:
+            self._pipeline.began(self._job)
 
     def frames(self, frames: Frames) -> None:
         """More of its frames are on disk."""
+        if self._job.state.over:
+            return
         job, all_there = self._job, frames.captured == self._job.total
         job.captured = frames.captured
         self._pipeline.grew(job)

@@ -21,7 +21,7 @@ from scanner.wire import ArrayEntry, FileEntry, ScanStart
 from service.acquisition import Scan
 from service.endings import reason_to_fail
 from service.jobs import Job, JobState, JobStore
-from service.pipe import CancelAcquire, Ended, Need, Taken, framed, read_command
+from service.pipe import CancelAcquire, Ended, Frames, Need, Taken, framed, read_command
 from service.pipeline import Pipeline
 from service.series import Series
 from service.spool import Spool
@@ -33,14 +33,17 @@ class Devices:
     def __init__(self) -> None:
         self.ended: asyncio.Future[Ended] = asyncio.get_running_loop().create_future()
         self.listener: Any = None
+        self.quick = True
+        """a scan begins before anybody can cancel it"""
 
     async def acquire(self, job: str, _folder: Path, _params: ScanStart, listener: Any) -> Awaitable[Ended]:
         self.listener = listener
-        listener.began()
+        if self.quick:
+            listener.began()
         return self.ended
 
     def cancel(self, job: str) -> None:
-        raise AssertionError("nothing acquires any more")
+        """The listener hears of the job until the devices have seen to it."""
 
 
 class Workers:
@@ -66,6 +69,10 @@ class Store(JobStore):
         super().write(job_id, record)
 
 
+async def no_recovery(_: Job) -> None:
+    raise AssertionError("nothing was left")
+
+
 class Bench:
     def __init__(self, folder: Path) -> None:
         self.store, self.spool = Store(folder / "jobs"), Spool(folder / "spool")
@@ -83,10 +90,7 @@ class Bench:
     async def acquiring(self) -> Job:
         """A job whose frames are taken and whose folder is being closed."""
 
-        async def recover(_: Job) -> None:
-            raise AssertionError("nothing was left")
-
-        self.pipeline.start(recover)
+        self.pipeline.start(no_recovery)
         job = await self.pipeline.submit(ScanStart(str(uuid.uuid4())), "test")
         async with asyncio.timeout(5):
             while not self.workers.given:
@@ -130,6 +134,25 @@ async def test_nothing_is_told_of_a_scan_behind_its_end(bench: Bench) -> None:
         await asyncio.sleep(0)
     assert bench.events[-1] == "cancelled"
     assert bench.workers.given[0].end is None
+
+
+async def test_a_scan_that_begins_as_it_is_cancelled_is_given_to_no_worker(bench: Bench) -> None:
+    bench.devices.quick = False
+    bench.pipeline.start(no_recovery)
+    job = await bench.pipeline.submit(ScanStart(str(uuid.uuid4())), "test")
+    async with asyncio.timeout(5):
+        while bench.devices.listener is None:
+            await asyncio.sleep(0)
+    await bench.pipeline.cancel(job)
+    heard = bench.devices.listener  # what the devices said before they heard of it
+    await heard.need(Need(job.id, frames=1, bytes=1, plan={}))
+    heard.began()
+    heard.frames(Frames(job.id, 1, 1, 0))
+    heard.taken(Taken(job.id, 1))
+    bench.end(job)
+    await until(bench, "cancelled")
+    assert bench.workers.given == []
+    assert bench.events[-1] == "cancelled"
 
 
 async def test_points_are_told_before_the_disk_is_done_and_acquired_is_not(bench: Bench) -> None:
