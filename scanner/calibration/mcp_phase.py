@@ -45,10 +45,12 @@ anywhere, one time in four by chance near one"""
 
 @dataclass(frozen=True)
 class McpPhase:
-    """The line row = slope index + intercept; deviation_px: largest distance from the ideal one over all stripes;
+    """The line row = slope index + intercept; deviation_px: largest distance from the ideal one over the stripes seen;
     rms_px: of the peaks kept; stripes, peaks, outliers: how many; wrong_codes: outliers that are whole stripes off.
 
-    expanded: U of slope, intercept, deviation_px and rms_px, each None where too few stripes tell.
+    stripe_range: the first and the last stripe seen; stripe_count: how many the pattern has.
+    farthest_px: what the distance from the ideal line may be at any stripe of the pattern, its uncertainty included.
+    expanded: U of slope, intercept, deviation_px and rms_px. It and farthest_px are None where too few stripes tell.
     """
 
     slope: float
@@ -59,6 +61,9 @@ class McpPhase:
     peaks: int
     outliers: int
     wrong_codes: int
+    stripe_range: tuple[int, int]
+    stripe_count: int
+    farthest_px: float | None
     expanded: dict[str, float | None]
 
     @property
@@ -73,24 +78,37 @@ class McpPhase:
 
     @property
     def good(self) -> bool | None:
-        """Whether nothing is wrong; None: the deviation is within NOTABLE_PX, but not surely so."""
+        """Whether nothing is wrong; None: deviation and scatter are within NOTABLE_PX, but not surely so."""
         if max(self.deviation_px, self.rms_px) > NOTABLE_PX or self.outlying > NOTABLE_OUTLIERS:
             return False
-        unsure = self.expanded["deviation_px"]
-        return None if unsure is None or self.deviation_px + unsure > NOTABLE_PX else True
+        return None if self.open_questions else True
+
+    @property
+    def open_questions(self) -> tuple[str, ...]:
+        """Which figures are within what is allowed, but not surely so: deviation_px, rms_px."""
+        scatter, farthest = self.expanded["rms_px"], self.farthest_px
+        sure = {
+            "deviation_px": farthest is not None and farthest <= NOTABLE_PX,
+            "rms_px": scatter is not None and self.rms_px + scatter <= NOTABLE_PX,
+        }
+        return tuple(name for name, known in sure.items() if not known)
 
 
-def mcp_phase(rows: NDArray[Any], peaks: NDArray[Any], pitch_px: float, *, axis: str = "y") -> McpPhase:
+def mcp_phase(
+    rows: NDArray[Any], peaks: NDArray[Any], pitch_px: float, stripe_count: int, *, axis: str = "y"
+) -> McpPhase:
     """Fit the line.
 
     Args:
         rows: (H, W) float32 projector rows (columns for axis x) by PMP, NaN where undecided.
         peaks: (M, 5) of an MCP scan of the same scene: x, y, row, stripe index, confidence.
         pitch_px: height of one stripe.
+        stripe_count: stripes of the pattern.
         axis: of the pattern; only for messages.
 
     Raises:
-        DecodeError: too few peaks on pixels that PMP measured, or all on one stripe; the scans are of two scenes.
+        DecodeError: too few peaks on pixels that PMP measured, or those that agree all on one stripe; the scans
+            are of two scenes.
     """
     index, seen = _on_measured(rows, peaks)
     if len(index) < FEWEST_PEAKS or np.ptp(index) == 0:
@@ -99,28 +117,31 @@ def mcp_phase(rows: NDArray[Any], peaks: NDArray[Any], pitch_px: float, *, axis:
             hint=_SCAN_AGAIN.format(axis=axis),
         )
     _require_one_scene(seen - (pitch_px * index + pitch_px / 2 - 0.5), pitch_px, axis)
-    kept = np.ones(len(index), dtype=bool)
-    slope, intercept = pitch_px, pitch_px / 2 - 0.5
-    for _ in range(ROUNDS):
-        off = seen - slope * index - intercept
-        # From the ideal line first: wrong codes are whole stripes off and must not bend the first fit.
-        spread = max(1.4826 * float(np.median(np.abs(off - np.median(off[kept])))), 1e-3)
-        kept = np.abs(off - np.median(off[kept])) < OUTLIER_SIGMAS * spread
-        slope, intercept = (float(v) for v in np.polyfit(index[kept], seen[kept], 1))
+    slope, intercept, kept = _fitted(index, seen, pitch_px, axis)
     off = seen - slope * index - intercept
-    ends = np.array([index[kept].min(), index[kept].max()])
-    deviation = (slope - pitch_px) * ends + intercept - (pitch_px / 2 - 0.5)
-    worst = float(ends[np.argmax(np.abs(deviation))])
+    spreads = _Spreads(index[kept], off[kept])
+
+    def deviation(stripe: int) -> float:
+        return abs((slope - pitch_px) * stripe + intercept - (pitch_px / 2 - 0.5))
+
+    ends = int(index[kept].min()), int(index[kept].max())
+    worst = max(ends, key=deviation)
+    farthest = [
+        deviation(stripe) + unsure for stripe in (0, stripe_count - 1) if (unsure := spreads.row(stripe)) is not None
+    ]
     return McpPhase(
         slope,
         intercept,
-        float(np.abs(deviation).max()),
+        deviation(worst),
         float(np.sqrt((off[kept] ** 2).mean())),
         len(np.unique(index[kept])),
         int(kept.sum()),
         int((~kept).sum()),
         int((~kept & _other_stripe(off, pitch_px) & _whole(off, pitch_px)).sum()),
-        _expanded(index[kept], off[kept], worst),
+        ends,
+        stripe_count,
+        max(farthest, default=None),
+        {**spreads.line(), "deviation_px": spreads.row(worst), "rms_px": spreads.rms()},
     )
 
 
@@ -139,6 +160,25 @@ def _on_measured(rows: NDArray[Any], peaks: NDArray[Any]) -> tuple[Array, Array]
     ].astype(np.float64)
     known = np.isfinite(seen)
     return whole[known, 3], seen[known]
+
+
+def _fitted(index: Array, seen: Array, pitch_px: float, axis: str) -> tuple[float, float, NDArray[np.bool_]]:
+    """Slope and intercept, and which peaks they are of.
+
+    Raises:
+        DecodeError: these are all on one stripe.
+    """
+    kept = np.ones(len(index), dtype=bool)
+    slope, intercept = pitch_px, pitch_px / 2 - 0.5
+    for _ in range(ROUNDS):
+        off = seen - slope * index - intercept
+        # From the ideal line first: wrong codes are whole stripes off and must not bend the first fit.
+        spread = max(1.4826 * float(np.median(np.abs(off - np.median(off[kept])))), 1e-3)
+        kept = np.abs(off - np.median(off[kept])) < OUTLIER_SIGMAS * spread
+        if np.ptp(index[kept]) == 0:
+            raise DecodeError("all stripe peaks that agree are on one stripe", hint=_SCAN_AGAIN.format(axis=axis))
+        slope, intercept = (float(v) for v in np.polyfit(index[kept], seen[kept], 1))
+    return slope, intercept, kept
 
 
 def _require_one_scene(off: Array, pitch_px: float, axis: str) -> None:
@@ -170,26 +210,42 @@ def _whole(off: Array, pitch_px: float) -> NDArray[np.bool_]:
     return np.asarray(np.abs(steps - np.round(steps)) < WHOLE_SHARE)
 
 
-def _expanded(index: Array, off: Array, worst: float) -> dict[str, float | None]:
-    """U of the line's figures, by how much stripes as wholes differ: along a stripe peaks are fitted together, so that
-    their errors are alike and their number tells nothing (cluster-robust: Liang and Zeger 1986, Biometrika 73, 13)."""
-    stripes, at = np.unique(index, return_inverse=True)
-    freedom = len(stripes) - 2
-    if freedom < 1:
-        return dict.fromkeys(("slope", "intercept", "deviation_px", "rms_px"))
-    design = np.column_stack((index, np.ones_like(index)))
-    inverse = np.linalg.inv(design.T @ design)
-    scores = np.column_stack([np.bincount(at, design[:, k] * off) for k in (0, 1)])
-    covariance = inverse @ (scores.T @ scores) @ inverse * len(stripes) / freedom
-    end = np.array([worst, 1.0])
-    rms = float(np.sqrt((off**2).mean()))
-    squares = np.bincount(at, off**2 - rms**2)
-    of_rms = float(np.sqrt(squares @ squares * len(stripes) / freedom)) / (len(off) * 2 * max(rms, 1e-12))
-    spreads = {
-        "slope": float(np.sqrt(covariance[0, 0])),
-        "intercept": float(np.sqrt(covariance[1, 1])),
-        "deviation_px": float(np.sqrt(max(end @ covariance @ end, 0.0))),
-        "rms_px": of_rms,
-    }
-    factor = float(student.ppf((1 + COVERAGE) / 2, freedom))
-    return {name: factor * spread for name, spread in spreads.items()}
+class _Spreads:
+    """U of a line's figures, by how much stripes as wholes differ: along a stripe peaks are fitted together, so that
+    their errors are alike and their number tells nothing (cluster-robust: Liang and Zeger 1986, Biometrika 73, 13).
+    None where fewer than three stripes tell."""
+
+    def __init__(self, index: Array, off: Array) -> None:
+        """index, off: (M,) stripe and distance from the line of every peak."""
+        self._off = off
+        self._stripes, self._at = np.unique(index, return_inverse=True)
+        self._freedom = len(self._stripes) - 2
+        if self._freedom < 1:
+            return
+        design = np.column_stack((index, np.ones_like(index)))
+        inverse = np.linalg.inv(design.T @ design)
+        scores = np.column_stack([np.bincount(self._at, design[:, k] * off) for k in (0, 1)])
+        self._covariance = inverse @ (scores.T @ scores) @ inverse * len(self._stripes) / self._freedom
+        self._factor = float(student.ppf((1 + COVERAGE) / 2, self._freedom))
+
+    def row(self, stripe: float) -> float | None:
+        """Of the line's row at a stripe."""
+        return self._along(np.array([stripe, 1.0]))
+
+    def line(self) -> dict[str, float | None]:
+        """Of slope and intercept."""
+        return {"slope": self._along(np.array([1.0, 0.0])), "intercept": self._along(np.array([0.0, 1.0]))}
+
+    def rms(self) -> float | None:
+        """Of the peaks' rms about the line."""
+        if self._freedom < 1:
+            return None
+        rms = float(np.sqrt((self._off**2).mean()))
+        squares = np.bincount(self._at, self._off**2 - rms**2)
+        spread = float(np.sqrt(squares @ squares * len(self._stripes) / self._freedom))
+        return self._factor * spread / (len(self._off) * 2 * max(rms, 1e-12))
+
+    def _along(self, direction: Array) -> float | None:
+        if self._freedom < 1:
+            return None
+        return self._factor * float(np.sqrt(max(direction @ self._covariance @ direction, 0.0)))

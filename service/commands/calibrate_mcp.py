@@ -14,6 +14,7 @@ from service.terminal import print_error, print_facts, print_json
 
 if TYPE_CHECKING:
     from scanner.calibration.mcp_phase import McpPhase
+    from scanner.patterns import McpPattern
 
 _PHASES = ("pmp", "gray+pmp")
 """Methods whose rows are phases at every pixel: finer than what they are to check."""
@@ -56,15 +57,16 @@ def mcp(
 
     if output is not None:
         try_file(output)
-    rows, peaks, pitch, axis = _both(pmp, single)
-    fit = mcp_phase(rows, peaks, pitch, axis=axis)
+    rows, peaks, pattern, pitch = _both(pmp, single)
+    axis = pattern.axis
+    fit = mcp_phase(rows, peaks, pitch, pattern.stripe_count, axis=axis)
     if calibration is not None and output is not None:
         content = {**load_calibration(calibration).as_dict(), "mcp_phase": fit.member}
         content["id"] = content_id(content)
         replace_file(output, as_text(content).encode())
     ideal = {"slope": pitch, "intercept": pitch / 2 - 0.5}
     if as_json:
-        verdict = {"good": fit.good, "axis": axis, "coverage_factor": 2.0}
+        verdict = {"good": fit.good, "open_questions": fit.open_questions, "axis": axis, "coverage_factor": 2.0}
         print_json({**vars(fit), "ideal": ideal, "file": output and str(output), **verdict})
     else:
         facts = _facts(fit, pitch, "row" if axis == "y" else "column")
@@ -78,11 +80,7 @@ def _facts(fit: McpPhase, pitch: float, line: str) -> list[tuple[str, Any]]:
     from scanner.calibration.mcp_phase import NOTABLE_OUTLIERS, NOTABLE_PX  # noqa: PLC0415
 
     shown = {name: with_uncertainty(getattr(fit, name), unsure) for name, unsure in fit.expanded.items()}
-    verdict = {
-        True: "good",
-        False: "not good",
-        None: "not sure: the deviation is within what is allowed, but with its uncertainty it may not be",
-    }[fit.good]
+    verdict = {True: "good", False: "not good", None: f"not sure: {_open(fit)}"}[fit.good]
     allowed = f"at most {NOTABLE_PX:g} {line}s of deviation and of scatter, {NOTABLE_OUTLIERS:.0%} outliers are allowed"
     return [
         ("verdict", f"{verdict} ({allowed})"),
@@ -90,12 +88,28 @@ def _facts(fit: McpPhase, pitch: float, line: str) -> list[tuple[str, Any]]:
         ("ideal", f"{line} = {pitch:.5f} x stripe + {pitch / 2 - 0.5:.4f}"),
         (
             "deviation",
-            f"{shown['deviation_px']} {line}s from the ideal line, at the stripe where it is largest: to quote",
+            f"{shown['deviation_px']} {line}s from the ideal line, at the stripe, of those seen, where it is largest: "
+            "to quote",
         ),
         ("scatter", f"{shown['rms_px']} {line}s rms of the peaks about the line: how far a single peak goes astray"),
-        ("peaks", f"{fit.peaks:,} on {fit.stripes} stripes; {_outliers(fit)}"),
+        ("peaks", f"{fit.peaks:,} on {fit.stripes} of {fit.stripe_count} stripes, {_range(fit)}; {_outliers(fit)}"),
         ("+-", "expanded uncertainty, k = 2, by how much the stripes differ"),
     ]
+
+
+def _range(fit: McpPhase) -> str:
+    return f"from {fit.stripe_range[0]} to {fit.stripe_range[1]}"
+
+
+def _open(fit: McpPhase) -> str:
+    """What a verdict that is neither waits for."""
+    what = {
+        "deviation_px": f"the stripes seen, {_range(fit)}, do not tell the line at the others, which may be off by "
+        + ("any amount" if fit.farthest_px is None else f"{fit.farthest_px:.2g}")
+        + ": let the board fill the field",
+        "rms_px": "the scatter is within what is allowed, but with its uncertainty it may not be",
+    }
+    return "; ".join(what[name] for name in fit.open_questions)
 
 
 def _outliers(fit: McpPhase) -> str:
@@ -133,8 +147,8 @@ def _troubles(fit: McpPhase, lines: str) -> list[tuple[str, str]]:
     return found
 
 
-def _both(pmp: Path, single: Path) -> tuple[Any, Any, float, str]:
-    """PMP's map along MCP's axis, MCP's peaks, its pitch and axis."""
+def _both(pmp: Path, single: Path) -> tuple[Any, Any, McpPattern, float]:
+    """PMP's map along MCP's axis, MCP's peaks, its pattern and pitch."""
     from scanner.capture import Capture  # noqa: PLC0415
     from scanner.errors import DecodeError  # noqa: PLC0415
     from scanner.patterns import McpPattern  # noqa: PLC0415
@@ -156,4 +170,4 @@ def _both(pmp: Path, single: Path) -> tuple[Any, Any, float, str]:
         )
     if rows.shape != stripes.shape:
         raise DecodeError(f"{pmp} and {single} have pictures of different sizes")
-    return rows, stripes.peaks, sequence.pattern.pitch_px(sequence.projector), axis
+    return rows, stripes.peaks, sequence.pattern, sequence.pattern.pitch_px(sequence.projector)

@@ -40,24 +40,24 @@ def stripes(slope: float, intercept: float, wrong: int = 0) -> tuple[np.ndarray,
 
 def test_line_of_the_stripes_is_found() -> None:
     rows, peaks = stripes(27.0, 13.0)
-    found = mcp_phase(rows, peaks, 27.0)
+    found = mcp_phase(rows, peaks, 27.0, 32)
     assert (found.slope, found.intercept) == pytest.approx((27.0, 13.0), abs=0.01)
     assert found.deviation_px < 0.03
     assert found.rms_px == pytest.approx(0.05, rel=0.1)
     assert found.outliers < 5
-    off = mcp_phase(*stripes(27.02, 12.8), 27.0)
+    off = mcp_phase(*stripes(27.02, 12.8), 27.0, 32)
     assert off.deviation_px == pytest.approx(0.42, abs=0.03)
     assert off.member == {"slope": off.slope, "intercept": off.intercept}
 
 
 def test_wrong_codes_are_left_out() -> None:
     rows, peaks = stripes(27.0, 13.0, wrong=60)
-    found = mcp_phase(rows, peaks, 27.0)
+    found = mcp_phase(rows, peaks, 27.0, 32)
     assert (found.slope, found.intercept) == pytest.approx((27.0, 13.0), abs=0.02)
     assert 55 <= found.outliers <= 70
     assert found.wrong_codes >= 55
     assert found.good is False, "7 % are more than a board has"
-    assert mcp_phase(*stripes(27.0, 13.0), 27.0).good
+    assert mcp_phase(*stripes(27.0, 13.0), 27.0, 32).good
 
 
 def test_the_line_is_as_sure_as_stripes_differ() -> None:
@@ -68,12 +68,39 @@ def test_the_line_is_as_sure_as_stripes_differ() -> None:
         peaks = plain[plain[:, 3] == np.round(plain[:, 3])].copy()
         off = np.random.default_rng(seed).normal(0, 0.1, 32)
         peaks[:, 1] += off[peaks[:, 3].astype(int)] / 2  # rows are 2 a pixel
-        found = mcp_phase(rows, peaks, 27.0)
+        found = mcp_phase(rows, peaks, 27.0, 32)
         assert found.expanded["slope"] is not None
         within.append(abs(found.slope - 27.0) < found.expanded["slope"])
     assert 34 <= sum(within) <= 40, "95 % are expected"
     two = plain[np.isin(plain[:, 3], (10, 11))]
-    assert set(mcp_phase(rows, np.repeat(two, 5, axis=0), 27.0).expanded.values()) == {None}
+    assert set(mcp_phase(rows, np.repeat(two, 5, axis=0), 27.0, 32).expanded.values()) == {None}
+
+
+def test_a_few_neighbouring_stripes_say_nothing_of_the_others() -> None:
+    """Wherever the line may be off at a stripe of the pattern by more than is allowed, it is not called good."""
+    rows, peaks = stripes(27.0, 13.0)
+    few = np.isin(peaks[:, 3], (14, 15, 16))
+    found = mcp_phase(rows, np.repeat(peaks[few], 4, axis=0), 27.0, 32)
+    assert found.farthest_px is not None
+    assert found.deviation_px < 0.05
+    assert found.farthest_px > 0.2
+    assert (found.good, found.open_questions) == (None, ("deviation_px",))
+    assert (found.stripe_range, found.stripe_count) == ((14, 16), 32)
+    whole = mcp_phase(rows, peaks, 27.0, 32)
+    assert whole.farthest_px is not None
+    assert whole.farthest_px < 0.1
+
+
+def test_a_scatter_that_may_be_too_large_is_not_called_good() -> None:
+    """Half of the stripes scatter more than is allowed, half less, all of them together just less."""
+    rows, peaks = stripes(27.0, 13.0)
+    table = peaks[peaks[:, 3] == np.round(peaks[:, 3])].copy()
+    spread = np.where(table[:, 3] % 4 < 2, 0.26, 0.1)
+    table[:, 1] += np.random.default_rng(2).normal(0, spread / 2).astype(np.float32)  # rows are 2 a pixel
+    found = mcp_phase(rows, table, 27.0, 32)
+    assert found.expanded["rms_px"] is not None
+    assert found.rms_px < 0.2 < found.rms_px + found.expanded["rms_px"]
+    assert (found.good, found.open_questions) == (None, ("rms_px",))
 
 
 def test_scans_of_two_scenes_are_refused() -> None:
@@ -83,13 +110,13 @@ def test_scans_of_two_scenes_are_refused() -> None:
     there[:, :40] += np.linspace(20, 100, 40, dtype=np.float32)
     for other in (there, rows + np.float32(40.5), rows + np.float32(54)):
         with pytest.raises(DecodeError, match=r"are not of one scene: at .* PMP has columns of another stripe"):
-            mcp_phase(other, peaks, 27.0, axis="x")
+            mcp_phase(other, peaks, 27.0, 32, axis="x")
 
 
 def test_too_few_peaks_are_refused() -> None:
     rows, peaks = stripes(27.0, 13.0)
     with pytest.raises(DecodeError, match="stripe peaks lie on pixels"):
-        mcp_phase(np.full_like(rows, np.nan), peaks, 27.0)
+        mcp_phase(np.full_like(rows, np.nan), peaks, 27.0, 32)
 
 
 def test_mcp_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -120,7 +147,7 @@ def test_mcp_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     said = capsys.readouterr()
     assert re.search(r"row = \(2[67]\.\d+ \+- 0\.\d+\) x stripe \+ \(1[23]\.\d+ \+- 0\.\d+\)", said.out)
     assert "verdict    good (at most 0.2 rows of deviation and of scatter, 5% outliers are allowed)" in said.out
-    assert "at the stripe where it is largest: to quote" in " ".join(said.out.split())
+    assert "at the stripe, of those seen, where it is largest: to quote" in " ".join(said.out.split())
     assert "differ" not in said.err
     off = str(save(tmp_path / "off", None, method="pmp", rows=rows + np.float32(0.4)))
     assert main(["calibrate", "mcp", off, str(single)]) == 0
