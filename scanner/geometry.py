@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.bounded_files import read_small_text
-from scanner.calibration_id import id_warnings
+from scanner.calibration_id import content_id, id_warnings
 from scanner.covariance import read_covariance
 from scanner.credible import check_hall, check_response, check_slope, lens_warnings, pixel_warnings, rig_warnings
 from scanner.errors import CalibrationError
@@ -193,8 +193,8 @@ def calibration_from_dict(content: Any, name: str = "calibration") -> Calibratio
         )
     if content.get("units", "mm") != "mm":
         raise CalibrationError(f"{name}: units are {content['units']!r:.80}, lengths must be in mm")
-    identity = "" if content.get("id") is None else content["id"]
-    if not isinstance(identity, str):
+    identity = content.get("id")
+    if identity is not None and not isinstance(identity, str):
         raise CalibrationError(f"{name}: id is {identity!r:.80}, it must be text", hint="leave it out, or quote it")
     _check_optional(content, name)
     camera, projector = (_lens(content.get(side), f"{name}: {side}") for side in ("camera", "projector"))
@@ -215,7 +215,8 @@ def calibration_from_dict(content: Any, name: str = "calibration") -> Calibratio
         )
     known = {"format", "version", "id", "camera", "projector", "rotation", "translation"}
     extra = {key: value for key, value in content.items() if key not in known}
-    rig = Calibration(camera, projector, rotation, translation, id=identity, extra=extra)
+    # What has no name is named by what it says: a scan can always tell what it rests on.
+    rig = Calibration(camera, projector, rotation, translation, id=identity or content_id(content), extra=extra)
     odd += [*rig_warnings(rig, name), *_covariance_warnings(content, name)]
     return replace(rig, warnings=tuple(odd))
 

@@ -75,6 +75,21 @@ def test_a_calibration_survives_its_file(rig_of, tmp_path):
     assert load_calibration(path).as_dict() == back.as_dict()
 
 
+@pytest.mark.parametrize("absent", [None, ""])
+def test_a_calibration_without_an_id_is_named_by_its_contents(rig_of, tmp_path, absent):
+    content = {**rig_of("x").as_dict(), "id": absent}
+    path = tmp_path / "calibration.json"
+    names = []
+    for baseline in (0, 0, 1):
+        content["translation"][1] += baseline
+        path.write_text(json.dumps(content))
+        names.append(load_calibration(path).id)
+    assert names[0] == names[1] != names[2]
+    content["id"] = names[2]  # which is the one it would have been written with
+    path.write_text(json.dumps(content))
+    assert not any("edited by hand" in said for said in load_calibration(path).warnings)
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
