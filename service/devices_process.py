@@ -134,8 +134,10 @@ class DevicesProcess:
                 self._outbox.post(Devices(number, _discovered()))
             case CancelAcquire():
                 _log.debug("cancelled: %s", command.job)  # seen to by the reader, while it ran
-            case Go():
+            case Go() if command.job not in self._cancelled:
                 _log.warning("no scan waits for its go")
+            case Go():
+                _log.debug("cancelled before its go: %s", command.job)
         return True
 
     def _acquire(self, command: Acquire | AcquireLive) -> None:
