@@ -34,6 +34,9 @@ LEAST_SIGMA = 1e-4
 MOST_MISFIT = 0.004
 """Rms that a pure exponent may leave, of white: half a second harmonic of a hundredth. Beyond, a table is wanted."""
 
+CHANCE_TIMES = 2.5
+"""Of what unsteady light makes: of sixteen levels, shown twice, one set in a thousand is beyond by chance (F test)"""
+
 
 @dataclass(frozen=True)
 class LevelResponse:
@@ -51,11 +54,16 @@ class LevelResponse:
     light: tuple[float, ...]
     """light 0 .. 1 of each level as seen"""
     pixels: int
+    unsteady: float | None = None
+    """1-sigma by which the light of one level differs from shot to shot, share of it, without what drifts evenly; None
+    where no level was shown twice"""
+    chance: float = 0.0
+    """misfit that unsteady light makes"""
 
     @property
     def response(self) -> dict[str, Any]:
-        """`response.projector` of a calibration file: the exponent where it fits, else the table."""
-        if self.misfit <= MOST_MISFIT:
+        """`response.projector` of a calibration file: the exponent where it fits, but for chance, else the table."""
+        if self.misfit <= max(MOST_MISFIT, CHANCE_TIMES * self.chance):
             return {"gamma": round(self.gamma, 4)}
         return {"table": [round(value, 6) for value in self.table]}
 
@@ -68,6 +76,7 @@ class LevelResponse:
             "levels": list(self.levels),
             "light": list(self.light),
             "pixels": self.pixels,
+            "unsteady": self.unsteady,
             "response": self.response,
         }
 
@@ -110,8 +119,10 @@ def response_of_levels(
         raise CalibrationError(
             "too few pixels are lit without clipping", hint="expose shorter: white must stay below the camera's range"
         )
-    weight = contrast[use]
-    light = ((means[:, use] - means[0, use]) @ weight) / float(weight @ weight)
+    weight = contrast[use] / float(contrast[use] @ contrast[use])
+    shots = np.array([(np.asarray(frame, np.float64)[use] - means[0, use]) @ weight for frame in frames])
+    shown = np.array([np.count_nonzero(values == v) for v in steps])
+    light = np.bincount(np.searchsorted(steps, values), shots) / shown
     falls = np.flatnonzero(np.diff(light) < -0.01)
     if falls.size:
         raise CalibrationError(
@@ -120,29 +131,60 @@ def response_of_levels(
         )
     light = np.clip(np.maximum.accumulate(light), 0, 1)
     # Rounding is averaged over pixels only where noise or texture dithers it: it is taken as the same in all.
-    gamma, sigma, misfit = _exponent(steps, light, float(1 / np.sqrt(12 * np.mean(weight**2))))
+    gamma, sigma, misfit = _exponent(steps, light, float(1 / np.sqrt(12 * np.mean(contrast[use] ** 2))))
     table = np.clip(PchipInterpolator(steps, light)(np.arange(256)), 0, 1)
+    unsteady = _unsteadiness(values, shots)
+    chance = 0.0 if unsteady is None else unsteady * float(np.sqrt(np.mean(light[1:] ** 2 / shown[1:])))
     return LevelResponse(
         gamma, sigma, misfit, tuple(float(v) for v in table), tuple(int(v) for v in steps),
-        tuple(float(v) for v in light), int(np.count_nonzero(use)),
+        tuple(float(v) for v in light), int(np.count_nonzero(use)), unsteady, chance,
     )  # fmt: skip
 
 
-def _exponent(levels: NDArray[Any], light: NDArray[np.float64], rounding: float) -> tuple[float, float, float]:
-    """Least squares of light = (level / 255)^g: g, its 1-sigma and the rms left; Gauss-Newton from a log-log fit.
+def _unsteadiness(values: NDArray[Any], shots: NDArray[np.float64]) -> float | None:
+    """See `LevelResponse.unsteady`.
 
-    rounding: 1-sigma that rounding to whole grey levels leaves in each light, share of white.
+    values: (F,) level of each shot. shots: (F,) light of each, share of white.
     """
-    inner = (levels > 0) & (levels < 255) & (light > 1e-4)
+    level, at = np.unique(values, return_inverse=True)
+    light = (np.bincount(at, shots) / np.bincount(at))[at]
+    use = (light > 0) & (np.bincount(at) > 1)[at]
+    freedom = np.count_nonzero(use) - len(np.unique(at[use])) - 1
+    if freedom < 1:
+        return None
+    groups, light = at[use], light[use]
+    off = shots[use] / light - 1
+    # An even drift is cancelled by levels that are shown up and down again: time, too, is taken from each level's mean.
+    time = np.flatnonzero(use).astype(np.float64)
+    time -= (np.bincount(groups, time, len(level)) / np.maximum(np.bincount(groups, minlength=len(level)), 1))[groups]
+    # In the dark the camera's noise is all there is: a level counts by its light.
+    weight = light**2
+    drift = float((weight * time) @ off) / max(float((weight * time) @ time), 1e-12)
+    share = weight / weight.mean()
+    return float(np.sqrt(share @ (off - drift * time) ** 2 / freedom))
+
+
+def _exponent(levels: NDArray[Any], light: NDArray[np.float64], rounding: float) -> tuple[float, float, float]:
+    """Least squares of light = white (level / 255)^g: g, its 1-sigma and the rms left; Gauss-Newton from a log-log fit.
+
+    White is one of the levels, no surer than the others, and every share of it as wrong as it is: the fit has white's
+    own light free, too. rounding: 1-sigma that rounding to whole grey levels leaves in each light, share of white.
+    """
+    inner = (levels > 0) & (light > 1e-4)
     v, seen = levels[inner] / 255.0, light[inner]
     logs = np.log(v)
     weight = seen**2
-    gamma = float((weight * logs * np.log(seen)).sum() / (weight * logs**2).sum())
-    for _ in range(5):
-        slope = v**gamma * logs
-        gamma += float(slope @ (seen - v**gamma) / (slope @ slope))
-    left = seen - v**gamma
-    misfit = float(np.sqrt(np.mean(left**2)))
-    slope = v**gamma * logs
-    variance = float(left @ left) / max(len(v) - 1, 1) + rounding**2
-    return gamma, max(float(np.sqrt(variance / (slope @ slope))), LEAST_SIGMA), misfit
+    gamma, white = float((weight * logs * np.log(seen)).sum() / (weight * logs**2).sum()), 1.0
+    for _ in range(6):
+        shape = v**gamma
+        slopes = np.column_stack((white * shape * logs, shape))
+        step = np.linalg.lstsq(slopes, seen - white * shape, rcond=None)[0]
+        gamma, white = gamma + float(step[0]), white + float(step[1])
+    left = seen - white * v**gamma
+    shares = np.linalg.inv(slopes.T @ slopes) @ slopes.T
+    # Bright levels flicker most: each level's own remainder tells of it (HC3: MacKinnon and White 1985, J. Econometrics
+    # 29, 305); of one that the fit follows closely little remains.
+    followed = np.einsum("ij,ji->i", slopes, shares)
+    variance = (left / np.maximum(1 - followed, 0.1)) ** 2 + rounding**2
+    sigma = float(np.sqrt(shares[0] ** 2 @ variance))
+    return gamma, max(sigma, LEAST_SIGMA), float(np.sqrt(np.mean(left**2)))

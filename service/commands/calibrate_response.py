@@ -185,9 +185,14 @@ def _facts(found: LevelResponse | Response) -> list[tuple[str, str]]:
         ]
     fits = "an exponent fits" if "gamma" in found.response else "no exponent fits: a table"
     gamma = with_uncertainty(found.gamma, 2 * found.sigma)
+    steady = (
+        "each shown once: whether the light is steady is not known"
+        if found.unsteady is None
+        else f"the light of one is steady to {found.unsteady:.2%}"
+    )
     return [
         ("gamma", f"{gamma} (k = 2), with {found.misfit:.2%} of white left: {fits}"),
-        ("levels", f"{len(found.levels)}, seen by {found.pixels:,} pixels"),
+        ("levels", f"{len(found.levels)}, seen by {found.pixels:,} pixels; {steady}"),
     ]
 
 

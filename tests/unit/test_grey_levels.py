@@ -25,12 +25,12 @@ def bent(value):
     return 0.5 - 0.5 * np.cos(np.pi * x**1.4)
 
 
-def shots(response, levels=LEVELS, noise=0.8, ambient=9.0, drift=0.0, seed=1):
+def shots(response, levels=LEVELS, noise=0.8, ambient=9.0, drift=0.0, flicker=0.0, seed=1):
     random = np.random.default_rng(seed)
     albedo = np.where(np.mgrid[: SHAPE[0], : SHAPE[1]][1] > 70, 0.02, random.uniform(0.5, 1.0, SHAPE))
-    lights = 1 + drift * np.arange(len(levels)) / len(levels)
+    lights = 1 + drift * np.arange(len(levels)) / len(levels) + flicker * random.normal(size=len(levels))
     grey = [
-        (ambient + 200 * albedo * response(v)) * lamp + random.normal(0, noise, SHAPE)
+        ambient + 200 * albedo * response(v) * lamp + random.normal(0, noise, SHAPE)
         for v, lamp in zip(levels, lights, strict=True)
     ]
     return [np.rint(np.clip(g, 0, 255)).astype(np.uint8) for g in grey]
@@ -73,6 +73,30 @@ def test_levels_up_and_down_cancel_a_lamp_that_drifts():
     found = response_of_levels(levels, shots(lambda v: (v / 255) ** 2.2, levels, drift=0.1), 255)
     assert found.gamma == pytest.approx(2.2, abs=0.01)
     assert found.levels == LEVELS
+
+
+@pytest.mark.parametrize("levels", [LEVELS, (*LEVELS, *LEVELS[::-1])])
+@pytest.mark.parametrize(("gamma", "flicker"), [(0.6, 0.003), (1.0, 0.01), (2.2, 0.01)])
+def test_an_exponent_is_no_surer_than_the_light_is_steady(gamma, flicker, levels):
+    """Of single shots of each level, too: white, by which all are divided, is one of them."""
+    off = []
+    for seed in range(100):
+        found = response_of_levels(levels, shots(lambda v: (v / 255) ** gamma, levels, flicker=flicker, seed=seed), 255)
+        off.append(abs(found.gamma - gamma) / found.sigma)
+    assert np.mean(np.array(off) < 2) >= 0.87
+    assert np.sqrt(np.mean(np.square(off))) < 1.3
+
+
+def test_light_that_is_not_steady_is_told_from_a_response_that_is_no_exponent():
+    twice = (*LEVELS, *LEVELS[::-1])
+    for seed in range(20):
+        found = response_of_levels(twice, shots(lambda v: (v / 255) ** 2.2, twice, flicker=0.02, seed=seed), 255)
+        assert found.unsteady == pytest.approx(0.02, rel=0.6)
+        assert "gamma" in found.response
+        assert "table" in response_of_levels(twice, shots(bent, twice, flicker=0.005, seed=seed), 255).response
+    drifting = response_of_levels(twice, shots(lambda v: (v / 255) ** 2.2, twice, drift=0.1), 255)
+    assert drifting.unsteady == pytest.approx(0, abs=0.002)
+    assert response_of_levels(LEVELS, shots(bent), 255).unsteady is None
 
 
 @pytest.mark.parametrize(
