@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 RULER_ROOM_MM = 22.0
 """Below the target: ruler, numbers and name."""
 
+LEAST_WIDTH_MM = 110.0
+"""Of the sheet: the line below the ruler has room, and a ruler longer than a small target"""
+
 
 @dataclass(frozen=True)
 class Drawing:
@@ -51,7 +54,8 @@ def target_svg(target: Target, grey: float = 0.0) -> Drawing:
     ink = f"rgb({', '.join([str(round(255 * grey))] * 3)})"
     shapes, width, height = _circles(target) if target.discs else _squares(target)
     margin = 0.5 * target.spacing_mm
-    paper_width, target_height = width + 2 * margin, height + 2 * margin
+    side = max(margin, (LEAST_WIDTH_MM - width) / 2)
+    paper_width, target_height = width + 2 * side, height + 2 * margin
     paper_height = target_height + RULER_ROOM_MM
     ruler = float(max(10, int(width // 10) * 10))
     parts = [
@@ -60,10 +64,10 @@ def target_svg(target: Target, grey: float = 0.0) -> Drawing:
         f'viewBox="0 0 {paper_width:g} {paper_height:g}">',
         f"<title>{escape(target.spec)}</title>",
         f'<rect width="{paper_width:g}" height="{paper_height:g}" fill="white"/>',
-        f'<g fill="{ink}" transform="translate({margin:g} {margin:g})">',
+        f'<g fill="{ink}" transform="translate({side:g} {margin:g})">',
         *shapes,
         "</g>",
-        *_ruler(margin, target_height, ruler, target.spec),
+        *_ruler(side if side == margin else 5.0, target_height, ruler, target.spec),
         "</svg>",
     ]
     return Drawing("\n".join(parts) + "\n", paper_width, paper_height, ruler)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -232,7 +233,7 @@ def test_target_files_that_are_none(tmp_path: Path) -> None:
         assert "Raises" not in str(refused.value.hint)
 
 
-@pytest.mark.parametrize("spec", ["chessboard:4x3:20", "charuco:5x4:20"])
+@pytest.mark.parametrize("spec", ["chessboard:4x3:20", "charuco:5x4:20", "chessboard:4x3:5"])
 def test_printed_target_is_what_is_looked_for(spec: str) -> None:
     target = parse_target(spec)
     drawing = target_svg(target, 0.2)
@@ -242,9 +243,17 @@ def test_printed_target_is_what_is_looked_for(spec: str) -> None:
     assert len(found.ids) == len(target.points)
     # 8 px a mm: the squares have the size that was asked for.
     step = np.linalg.norm(found.points[found.ids == 1] - found.points[found.ids == 0])
-    assert step == pytest.approx(20 * 8, abs=0.1)
+    assert step == pytest.approx(target.spacing_mm * 8, abs=0.1)
     assert f'width="{drawing.width_mm:g}mm"' in drawing.text
     assert drawing.ruler_mm <= drawing.width_mm
+
+
+def test_the_ruler_of_a_small_target_is_on_the_sheet() -> None:
+    for spec in ("chessboard:3x3:1", "chessboard:4x3:20", "acircles:4x11:20"):
+        drawing = target_svg(parse_target(spec))
+        left, length = (float(v) for v in re.search(r"M([\d.]+) [\d.]+h([\d.]+)", drawing.text).groups())  # type: ignore[union-attr]
+        assert length == drawing.ruler_mm
+        assert 0 < left < left + length < drawing.width_mm
 
 
 def test_printed_circles_and_what_cannot_be_printed(tmp_path: Path) -> None:
