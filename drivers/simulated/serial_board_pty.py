@@ -98,7 +98,9 @@ class PtyBoard:
     def jump(self, ns: int) -> None:
         """The board's clock goes forward at once, as no crystal's does."""
         with self._lock:
+            self._go_on()
             self._began_ns -= ns
+            self._edges_until(self.now_ns())  # there were none in the time that never was
 
     def hang(self, hung: bool = True) -> None:
         """Neither read nor say anything from now on, or again."""
@@ -130,6 +132,8 @@ class PtyBoard:
         while not self._closing.is_set():
             readable = select.select([self._master], [], [], STEP_S)[0]
             if self._hung.is_set():
+                with self._lock:
+                    self._edges_until(self.now_ns())  # it does not see them
                 time.sleep(STEP_S)
                 continue
             with self._lock:
@@ -155,16 +159,25 @@ class PtyBoard:
     def _go_on(self) -> None:
         """Edges, pins and lines up to now."""
         now = self.now_ns()
-        while self._vsync_ns is not None and self._next_vsync_ns <= now:
-            if self._next_vsync_ns > now - self._vsync_ns // 2:  # after a pause the past is not made up for
-                self._board.edge("VSYNC", True, self._next_vsync_ns)
-                self._board.edge("VSYNC", False, self._next_vsync_ns + 1)
-            self._next_vsync_ns += round(self._vsync_ns * self._rate)
+        # All of them, each at its time, however late this thread comes: a board does not wait for its host's processor.
+        for t_ns in self._edges_until(now):
+            self._board.edge("VSYNC", True, t_ns)
+            self._board.edge("VSYNC", False, t_ns + 1)
         for output in self._board.advance(now):
             if isinstance(output, PinEdge):
                 self.pins.append(output)
             else:
                 self._send(output)
+
+    def _edges_until(self, now: int) -> list[int]:
+        """When VSYNC rose since it was asked last."""
+        vsync_ns = self._vsync_ns
+        if vsync_ns is None:
+            return []
+        period = round(vsync_ns * self._rate)
+        times = list(range(self._next_vsync_ns, now + 1, period))
+        self._next_vsync_ns += len(times) * period
+        return times
 
     def _send(self, said: Said) -> None:
         faults = self.faults

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.simulated.serial_board import PinEdge, SerialBoard
+from drivers.simulated.serial_board_pty import PtyBoard
 from tests.trigger_golden import Golden, Transcript, actions, differences, golden_files
 
 
@@ -62,3 +63,15 @@ def test_whatever_is_sent_every_line_has_one_answer_and_no_pin_moves(pieces: lis
         said = board.advance(number * 10**6)
         assert all(not isinstance(output, PinEdge) for output in said)
         assert len(said) == (0 if line in (b"", b"\r") else 1)
+
+
+def test_a_thread_that_comes_late_loses_no_edge() -> None:
+    """Nor does it see those that came while the board was deaf."""
+    with PtyBoard(vsync_us=1_000, clock_ppm=300.0) as board, board._lock:
+        last = board._next_vsync_ns
+        period = round(1_000_000 * (1 + 300e-6))
+        assert board._edges_until(last - 1) == []
+        assert board._edges_until(last + 25 * period) == [last + n * period for n in range(26)]
+        assert board._edges_until(last + 25 * period) == []
+        board.stop_vsync()
+        assert board._edges_until(last + 99 * period) == []
