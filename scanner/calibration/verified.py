@@ -64,12 +64,14 @@ noise, and neighbours err alike"""
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is to be measured in each scan."""
+    """What is to be measured in each scan. sphere_sigma_mm, length_sigma_mm: of what is stated, 1-sigma."""
 
     flat: bool = False
     sphere_mm: float | None = None
+    sphere_sigma_mm: float = 0.0
     target: Target | None = None
     length_mm: float | None = None
+    length_sigma_mm: float = 0.0
     marks: Marks | None = None
     edge: tuple[int, int, int, int] | None = None
 
@@ -96,12 +98,14 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
     if wanted.sphere_mm is not None:
         ball = sphere_points(scan.xyz, wanted.sphere_mm)
         found["sphere"] = _with_noise(plain(measured_sphere(ball, wanted.sphere_mm)), ball, scan, SPHERE, rig)
-        found["sphere"]["uncertainty"]["size_mm"] = found["sphere"]["uncertainty"]["diameter_mm"]
+        of_ball = found["sphere"]["uncertainty"]
+        of_ball["size_mm"] = _of_error(of_ball["diameter_mm"], wanted.sphere_sigma_mm)
     if wanted.target is not None:
         seen, ends = target_ends(scan.albedo, scan.xyz, wanted.target)
         of_length = spread_of_length(seen, wanted.target, scan.xyz, rig).as_dict()
         found["length"] = plain(length_between(ends, wanted.target, wanted.length_mm))
-        found["length"]["uncertainty"] = {"error_mm": of_length, "measured_mm": of_length}
+        of_error = _of_error(of_length, wanted.length_sigma_mm)
+        found["length"]["uncertainty"] = {"error_mm": of_error, "measured_mm": of_length}
     if found:
         found["coverage_factor"], found["unknown"] = COVERAGE_FACTOR, why
         another = None if wanted.target is None else of_another_kind(scan.albedo, wanted.target)
@@ -114,6 +118,16 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
     if wanted.marks is not None:
         found["marks"] = measured_marks(wanted.marks, scan.albedo, scan.xyz)
     return found
+
+
+def _of_error(measured: dict[str, float | None], reference: float) -> dict[str, float | None]:
+    """Uncertainties of an error, from those of what was measured and the 1-sigma of what it is measured against."""
+    if reference == 0:
+        return measured
+    expanded, rim = measured["expanded"], measured.get("rim") or 0.0
+    if expanded is not None:
+        expanded = float(np.hypot(expanded - rim, COVERAGE_FACTOR * reference)) + rim
+    return {**measured, "reference": reference, "expanded": expanded}
 
 
 def _require_within(part: tuple[int, int, int, int], scan: Scan) -> None:

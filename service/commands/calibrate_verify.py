@@ -22,9 +22,10 @@ def verify(
     scans: Annotated[list[Path], typer.Argument(metavar="SCAN...", help="Scans' folders, with points.")],
     flat: Annotated[bool, typer.Option("--flat", help="A flat board: flatness, rms, bow.")] = False,
     sphere: Annotated[
-        float | None,
+        str | None,
         typer.Option(
-            metavar="MM", min=0.1, max=1e5, help="A sphere of this diameter (not radius), mm: form and size error."
+            metavar="MM[:SIGMA]",
+            help="A sphere of this diameter (not radius), mm, and its 1-sigma: form and size error.",
         ),
     ] = None,
     target: Annotated[
@@ -32,8 +33,11 @@ def verify(
         typer.Option(metavar="TARGET", help="A target, as in solve: the length of its longest row of points."),
     ] = None,
     length: Annotated[
-        float | None,
-        typer.Option(metavar="MM", min=0.1, max=1e5, help="With --target: that length as measured; else as nominal."),
+        str | None,
+        typer.Option(
+            metavar="MM[:SIGMA]",
+            help="With --target: that length as measured, mm, and its 1-sigma; else as nominal.",
+        ),
     ] = None,
     repeat: Annotated[
         bool, typer.Option("--repeat", help="The scans are of one scene that did not move: repeatability.")
@@ -61,16 +65,17 @@ def verify(
     """Measure known features in scans, in the words of VDI/VDE 2634 part 2. All lengths are mm.
 
     Figures of a board, a sphere, a length have an expanded uncertainty (+-, k = 2): of the calibration, by its
-    covariance, and of the points used; --repeat's deviation has one from three scans on. Without one: --edge;
-    --marks, which say what is allowed; --repeat's drift.
+    covariance, and of the points used; an error's has that of what it is measured against, too, where it is given.
+    --repeat's deviation has one from three scans on. Without one: --edge; --marks, which say what is allowed;
+    --repeat's drift.
 
     \b
     Examples:
       fringed scan --rig simulated:casey2011/sphere_board -o scans/ball       something to verify
       fringed calibrate verify scans/ball --sphere 160 --flat --tolerance 1
       fringed calibrate verify board/ --flat --tolerance 0.2
-      fringed calibrate verify ball1 ball2 ball3 --sphere 50.012
-      fringed calibrate verify target/ --target charuco:10x7:30 --length 240.05
+      fringed calibrate verify ball1 ball2 ball3 --sphere 50.012:0.001
+      fringed calibrate verify target/ --target charuco:10x7:30 --length 240.05:0.02
       fringed calibrate verify board1 board2 board3 --flat --repeat --json
       fringed calibrate verify block/ --edge 1230,60,60,200
       fringed calibrate verify today/ --marks marks.json
@@ -86,6 +91,7 @@ def verify(
     if tolerance is not None and not (flat or repeat or known):
         raise typer.BadParameter("--tolerance is for errors, and the width of an edge is none")
     part = None if edge is None else region_given(edge, "--edge")
+    ball, row = _stated(sphere, "--sphere"), _stated(length, "--length")
     if repeat:
         _refuse_twice(scans)
     with progress_lines() as lines:
@@ -99,9 +105,9 @@ def verify(
 
         wanted = Wanted(
             flat,
-            sphere,
+            *ball,
             None if target is None else parse_target(target),
-            length,
+            *row,
             None if marks is None else load_marks(marks),
             part,
         )
@@ -131,6 +137,26 @@ def verify(
     for said in warnings_in(document):
         print_error(said, label="warning")
     return 0 if tolerance is None else _judged(errors_of(document), worst, tolerance)
+
+
+def _stated(text: str | None, option: str) -> tuple[float | None, float]:
+    """A length, mm, and its 1-sigma, as given.
+
+    Raises:
+        typer.BadParameter: they are none.
+    """
+    if text is None:
+        return None, 0.0
+    mm, colon, sigma = text.partition(":")
+    try:
+        length, unsure = float(mm), float(sigma) if colon else 0.0
+    except ValueError as error:
+        raise typer.BadParameter(f"{option}: expected MM or MM:SIGMA, got {text!r}") from error
+    if not 0.1 <= length <= 1e5:
+        raise typer.BadParameter(f"{option}: expected 0.1 .. 100000 mm, got {mm}")
+    if not 0 <= unsure < length:
+        raise typer.BadParameter(f"{option}: {sigma} mm is no uncertainty (1-sigma) of {length:g} mm")
+    return length, unsure
 
 
 def _judged(errors: list[Error], worst: Error | None, tolerance: float) -> int:

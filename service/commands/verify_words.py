@@ -256,7 +256,10 @@ def _of_systematic(besides: dict[str, Any] | None) -> str:
 def _of_uncertainty(one: dict[str, Any]) -> str:
     """What the uncertainties of a scan's figures contain, and why they are unknown where they are."""
     if one["unknown"] is None:
-        return "expanded uncertainty, k = 2: the calibration's covariance, and the points"
+        parts = [one[kind]["uncertainty"] for kind in ("sphere", "length") if kind in one]
+        stated = any("reference" in figure for part in parts for figure in part.values())
+        besides = "; of an error, what it is measured against" if stated else ""
+        return f"expanded uncertainty, k = 2: the calibration's covariance, and the points{besides}"
     return f"unknown, {one['unknown']}; the points' own part, k = 2, is up to {alone(2 * _points_part(one))} mm"
 
 

@@ -75,6 +75,32 @@ def test_a_calibration_that_was_edited_makes_no_points_anew(tmp_path: Path, caps
         assert ("edited by hand" in shown) == ("covariance" in changes)
 
 
+def test_an_error_is_no_surer_than_what_it_is_measured_against(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = str(tmp_path / "a")
+    content = rig()
+    content["id"] = content_id(content)
+    save_of_rig(tmp_path / "a", *ball_of_rig(), content["id"])
+    (tmp_path / "a" / "capture" / "calibration.json").write_text(json.dumps(content))
+    found = []
+    for given in ("120", "120:0", "120:0.5"):
+        assert main(["calibrate", "verify", folder, "--sphere", given, "--json"]) == 0
+        found.append(json.loads(capsys.readouterr().out)["scans"][0]["sphere"]["uncertainty"])
+    exact, none, given = (one["size_mm"] for one in found)
+    assert exact == none == found[0]["diameter_mm"]
+    rim = exact.get("rim", 0.0)
+    assert given["expanded"] - rim == pytest.approx(np.hypot(exact["expanded"] - rim, 2 * 0.5))
+    assert given["reference"] == 0.5
+    assert {**given, "expanded": 0, "reference": 0} == {**exact, "expanded": 0, "reference": 0}
+    assert found[2]["diameter_mm"] == found[0]["diameter_mm"]
+    assert main(["calibrate", "verify", folder, "--sphere", "120:0.5"]) == 0
+    assert "and the points; of an error, what it is measured against" in said(capsys)
+    for wrong in ("nan", "120:nan", "120:-1", "120:130", "x", "120:", "0.01", "1e9"):
+        assert main(["calibrate", "verify", folder, "--sphere", wrong]) == 2
+        assert "--sphere: " in capsys.readouterr().err
+
+
 def test_a_chessboard_with_markers_is_a_charuco_board(tmp_path: Path) -> None:
     board_with, chess = parse_target("charuco:10x7:30"), parse_target("chessboard:9x6:30")
     picture = cv2.copyMakeBorder(charuco_board(board_with).generateImage((600, 420)), 40, 40, 40, 40, 0, value=255)
