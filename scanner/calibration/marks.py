@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +34,11 @@ GROUND = 2.0
 """Radii around a mark within which its ground's plane is fitted."""
 IN_LINE = 0.05
 """Of marks' spread along a line: when they are no farther from it, what turns about it moves them by too little."""
-AREA_RATIO = 2.0
-"""By which a mark's area in the picture may differ from the reference's."""
+AREA_RATIO = 1.3
+"""By which a mark's area in the picture may differ from the reference's: one that is ten pixels across, and whose edge
+another exposure moves by half a pixel. Of one that is smaller a part is hidden."""
+UNIT = 1e-3
+"""By which a normal's length in a file may differ from 1."""
 NOTABLE_SHARE = 1e-4
 """Of the distance: movement from which it is worth a warning, 0.13 mm at 1346 mm, a third of a projector pixel on
 casey2011. Below, a disc's place in the picture (a twentieth of a pixel) and the scan's noise are as large."""
@@ -129,7 +133,8 @@ def measured_marks(marks: Marks, albedo: NDArray[Any], xyz: NDArray[Any]) -> dic
 
     `points`: for each its movement, mm, or None where it is hidden; `rms_mm`, `largest_mm` over those seen;
     `as_a_whole_mm`, `shape_mm`: the mean movement, and what is left after the best turn and shift of three or more;
-    `scale_ppm`: how much their distances have grown. `plate`: offset along its normal, mm, and turn, mrad.
+    `scale_ppm`: how much their distances have grown. `plate`: offset along its normal, mm, turn, mrad, and by how much
+    the edge of what is seen of it has moved at most, mm.
     `allowed_mm`, and `warning`, None or in words.
     """
     each, before, now = [], [], []
@@ -161,9 +166,10 @@ def parse_marks(content: Any, name: str) -> Marks:
     Raises:
         CalibrationError: it is no such content; `name` says where it stands.
     """
-    if not isinstance(content, Mapping) or content.get("format") != FORMAT or content.get("version") != VERSION:
+    mine = isinstance(content, Mapping) and content.get("format") == FORMAT and content.get("version") == VERSION
+    if not mine or content.get("units", "mm") != "mm":
         raise CalibrationError(
-            f"{name} is no {FORMAT} file of version {VERSION}", hint="fringed calibrate marks makes one"
+            f"{name} is no {FORMAT} file of version {VERSION} in mm", hint="fringed calibrate marks makes one"
         )
     try:
         points = tuple(
@@ -175,12 +181,16 @@ def parse_marks(content: Any, name: str) -> Marks:
         if given is not None:
             x, y, width, height = (int(value) for value in given["region"])
             plate = Plate((x, y, width, height), _triple(given["point"]), _triple(given["normal"]))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CalibrationError(f"{name}: points or plate are not as they should be ({error!r})") from error
     numbers = [value for mark in points for value in (*mark.at, mark.radius_px, *mark.xyz)]
     numbers += [*plate.point, *plate.normal] if plate is not None else []
     if not np.isfinite(numbers).all() or len(points) > MOST_MARKS or any(mark.radius_px <= 0 for mark in points):
         raise CalibrationError(f"{name}: points must be finite, {MOST_MARKS} at most, their radii positive")
+    if plate is not None and (min(plate.region[2:]) < 1 or abs(float(np.linalg.norm(plate.normal)) - 1) > UNIT):
+        raise CalibrationError(f"{name}: a plate needs a region of some width and height, and a normal of length 1")
+    if any(np.linalg.norm(np.subtract(a.xyz, b.xyz)) == 0 for a, b in combinations(points, 2)):
+        raise CalibrationError(f"{name}: two marks are at one place", hint="give each once")
     if len(points) < FEWEST_MARKS and plate is None:
         raise CalibrationError(f"{name} has {len(points)} marks and no plate: {FEWEST_MARKS} marks are needed")
     return Marks(points, plate, str(content.get("calibration", "")))
@@ -251,22 +261,30 @@ def _reach(radius: float) -> int:
 
 def _plate(xyz: NDArray[Any], region: tuple[int, int, int, int]) -> tuple[tuple[float, float, float], ...]:
     """A point of the plate in a region, and its unit normal towards the camera."""
+    point, normal = plane_of(_part(xyz, region))
+    return _triple(point), _triple(normal)
+
+
+def _part(xyz: NDArray[Any], region: tuple[int, int, int, int]) -> NDArray[Any]:
     x, y, width, height = region
-    part = xyz[max(y, 0) : y + height, max(x, 0) : x + width]
+    part = xyz[max(y, 0) : max(y + height, 0), max(x, 0) : max(x + width, 0)]
     if part.size == 0:
         raise DecodeError(f"the plate's region {region} lies outside the picture")
-    point, normal = plane_of(part)
-    return _triple(point), _triple(normal)
+    return part
 
 
 def _plate_moved(plate: Plate, xyz: NDArray[Any]) -> dict[str, Any]:
     try:
         point, normal = (np.array(each) for each in _plate(xyz, plate.region))
     except DecodeError as error:
-        return {"offset_mm": None, "turn_mrad": None, "why": str(error)}
+        return {"offset_mm": None, "turn_mrad": None, "edge_mm": None, "why": str(error)}
     offset = float((np.array(plate.point) - point) @ normal)
-    turn = float(np.linalg.norm(np.cross(plate.normal, normal)))
-    return {"offset_mm": -offset, "turn_mrad": 1e3 * float(np.arcsin(min(turn, 1.0)))}
+    turn = float(np.arcsin(min(float(np.linalg.norm(np.cross(plate.normal, normal))), 1.0)))
+    part = _part(xyz, plate.region)
+    away = np.linalg.norm(part[np.isfinite(part[..., 2])] - point, axis=-1)
+    # What is seen of it, without a few points that are wrong.
+    edge = abs(offset) + turn * float(np.percentile(away, 95))
+    return {"offset_mm": -offset, "turn_mrad": 1e3 * turn, "edge_mm": edge}
 
 
 def _movement(before: Array, now: Array) -> dict[str, Any]:
@@ -289,18 +307,39 @@ def _movement(before: Array, now: Array) -> dict[str, Any]:
 def _judged(marks: Marks, content: Mapping[str, Any]) -> dict[str, Any]:
     places = [mark.xyz for mark in marks.points] + ([marks.plate.point] if marks.plate is not None else [])
     allowed = NOTABLE_SHARE * float(np.median(np.linalg.norm(places, axis=1)))
-    offset = abs((content.get("plate") or {}).get("offset_mm") or 0.0)
-    worst = max(content.get("largest_mm", 0.0), offset)
-    warning = None
-    if worst > allowed:
-        what = "the plate" if offset >= content.get("largest_mm", 0.0) else "a witness mark"
-        warning = (
-            f"{what} is off by {worst:.3f} mm ({allowed:.3f} mm, a ten-thousandth of the distance, are let pass): the "
-            "rig, or the mark, has moved since the reference was taken"
+    moved = {"a witness mark": content.get("largest_mm", 0.0)}
+    if marks.plate is not None:
+        moved["the plate"] = content["plate"]["edge_mm"] or 0.0
+    what = max(moved, key=lambda name: float(moved[name]))
+    if moved[what] > allowed:
+        warning: str | None = (
+            f"{what} is off by {moved[what]:.3f} mm ({allowed:.3f} mm, a ten-thousandth of the distance, are let "
+            "pass): the rig, or the mark, has moved since the reference was taken, or something hides a part of it"
         )
-    elif marks.points and not content["seen"] and marks.plate is None:
-        warning = "none of the witness marks is seen: nothing vouches for this scan's geometry"
+    else:
+        warning = _too_little_seen(marks, content)
     return {"allowed_mm": allowed, "warning": warning}
+
+
+def _too_little_seen(marks: Marks, content: Mapping[str, Any]) -> str | None:
+    """What to say where less is seen than shows every movement."""
+    seen, plate = content["seen"], content.get("plate")
+    plate_seen = plate is not None and plate["edge_mm"] is not None
+    if not seen and not plate_seen:
+        of = [*(["witness marks"] if marks.points else []), *(["plate"] if plate is not None else [])]
+        return f"nothing is seen of the {' and the '.join(of)}: nothing vouches for this scan's geometry{_why(plate)}"
+    if plate is not None and not plate_seen:
+        return f"the plate cannot be measured{_why(plate)}"
+    if marks.points and seen < FEWEST_MARKS and not plate_seen:
+        return (
+            f"{seen} of {len(marks.points)} witness marks {'is' if seen == 1 else 'are'} seen: a turn about "
+            f"{'it' if seen == 1 else 'their line'} does not show"
+        )
+    return None
+
+
+def _why(plate: Mapping[str, Any] | None) -> str:
+    return f" ({plate['why']})" if plate is not None and "why" in plate else ""
 
 
 def _pair(values: Any) -> tuple[float, float]:
@@ -309,5 +348,7 @@ def _pair(values: Any) -> tuple[float, float]:
 
 
 def _triple(values: Any) -> tuple[float, float, float]:
+    if isinstance(values, str):
+        raise TypeError(f"{values!r} is no list of numbers")
     x, y, z = (float(value) for value in values)
     return x, y, z

@@ -149,8 +149,8 @@ def _of_scan(one: dict[str, Any]) -> Iterator[Error]:
     marks = one.get("marks") or {}
     if marks.get("largest_mm") is not None:
         yield Error(marks["largest_mm"], None, WORTH_MM, f"a witness mark in {one['scan']}")
-    if (offset := (marks.get("plate") or {}).get("offset_mm")) is not None:
-        yield Error(abs(offset), None, WORTH_MM, f"the plate in {one['scan']}")
+    if (edge := (marks.get("plate") or {}).get("edge_mm")) is not None:
+        yield Error(edge, None, WORTH_MM, f"the plate in {one['scan']}")
 
 
 def met(errors: Sequence[Error], worst: Error, tolerance: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,6 +76,58 @@ def test_a_shift_a_scale_and_a_step_of_the_plate_are_told_apart(marks: Marks) ->
     assert measured_marks(marks, albedo, turned)["plate"]["turn_mrad"] == pytest.approx(2.0, abs=0.1)
 
 
+def test_a_plate_that_turned_about_its_middle_has_moved(marks: Marks) -> None:
+    assert marks.plate is not None
+    alone = replace(marks, points=())
+    albedo, xyz = field(seed=2)
+    found = {}
+    for slope in (0.0, 0.02):
+        turned = xyz.copy()
+        turned[..., 2] += slope * (xyz[..., 0] - marks.plate.point[0])
+        found[slope] = measured_marks(alone, albedo, turned)
+    assert found[0.0]["warning"] is None
+    x, _, width, _ = marks.plate.region
+    reach = np.ptp(xyz[0, x : x + width, 0]) / 2
+    assert abs(found[0.02]["plate"]["offset_mm"]) < 0.02
+    assert 0.02 * reach * 0.8 < found[0.02]["plate"]["edge_mm"] < 0.02 * reach * 1.8
+    assert "the plate is off by" in found[0.02]["warning"]
+
+
+def test_what_is_hidden_and_what_does_not_show_then_is_told(marks: Marks) -> None:
+    albedo, xyz = field(seed=3)
+    blank, bare = np.full_like(albedo, 200), np.full_like(xyz, np.nan)
+    only = replace(marks, plate=None)
+    assert "the plate cannot be measured" in _warned(marks, albedo, _without_plate(marks, xyz))
+    assert "nothing is seen of the plate" in _warned(replace(marks, points=()), albedo, bare)
+    assert "nothing is seen of the witness marks and the plate" in _warned(marks, blank, bare)
+    assert _warned(marks, blank, xyz) == ""
+    one = albedo.copy()
+    one[:120, :150] = 200
+    assert "2 of 3 witness marks are seen: a turn about their line does not show" in _warned(only, one, xyz)
+
+
+def test_a_mark_that_is_hidden_by_a_third_is_hidden(marks: Marks) -> None:
+    albedo, xyz = field(seed=3)
+    first = marks.points[0]
+    (x, y), r = first.at, first.radius_px
+    albedo[round(y - 2 * r) : round(y + 2 * r), round(x - 2 * r) : round(x - 0.3 * r)] = 200
+    found = measured_marks(marks, albedo, xyz)
+    assert found["points"][0]["moved_mm"] is None
+    assert found["seen"] == 2
+
+
+def _warned(marks: Marks, albedo: np.ndarray, xyz: np.ndarray) -> str:
+    return measured_marks(marks, albedo, xyz)["warning"] or ""
+
+
+def _without_plate(marks: Marks, xyz: np.ndarray) -> np.ndarray:
+    assert marks.plate is not None
+    x, y, width, height = marks.plate.region
+    hidden = xyz.copy()
+    hidden[y : y + height, x : x + width] = np.nan
+    return hidden
+
+
 def test_a_hidden_mark_is_said_and_all_hidden_is_a_warning(marks: Marks) -> None:
     albedo, xyz = field(seed=3)
     albedo[:120, :150] = 200
@@ -83,7 +136,7 @@ def test_a_hidden_mark_is_said_and_all_hidden_is_a_warning(marks: Marks) -> None
     assert [one["moved_mm"] is None for one in found["points"]] == [True, False, True]
     nothing = measured_marks(replace(marks, plate=None), np.full_like(albedo, 200), xyz)
     assert nothing["seen"] == 0
-    assert "none of the witness marks" in nothing["warning"]
+    assert "nothing is seen of the witness marks" in nothing["warning"]
     bare = xyz.copy()
     bare[:] = np.nan
     assert measured_marks(marks, albedo, bare)["plate"]["offset_mm"] is None
@@ -122,6 +175,13 @@ def test_files_are_read_back_and_bad_ones_refused(marks: Marks, tmp_path: Path) 
         ({"points": plain["points"][:2], "plate": None}, "2 marks and no plate"),
         ({"points": [{"name": "1"}] * 3}, "not as they should be"),
         ({"points": [{**plain["points"][0], "radius_px": -1}] * 3}, "positive"),
+        ({"points": [{**plain["points"][0], "radius_px": 10**400}] * 3}, "not as they should be"),
+        ({"points": [{**plain["points"][0], "xyz": "123"}] * 3}, "not as they should be"),
+        ({"points": [plain["points"][0]] * 3}, "two marks are at one place"),
+        ({"plate": {**plain["plate"], "region": [10, 10, -50, 50]}}, "some width and height"),
+        ({"plate": {**plain["plate"], "region": [10, 10, math.inf, 50]}}, "not as they should be"),
+        ({"plate": {**plain["plate"], "normal": [0, 0, 0]}}, "a normal of length 1"),
+        ({"units": "m"}, "in mm"),
     ):
         with pytest.raises(CalibrationError, match=words):
             parse_marks({**plain, **change}, "marks")
