@@ -20,7 +20,7 @@ from scanner.calibration.hall import decompose, focal_spread, hall_matrix, proje
 from scanner.calibration.held_out import HeldOut
 from scanner.calibration.lens_slopes import rotation_of, vector_of
 from scanner.calibration.observe import LeftOut, Observation, warm_up_of, warnings_of
-from scanner.calibration.plausibility import MOST_RELATIVE_SIGMA, Facing, check_facing
+from scanner.calibration.plausibility import MOST_RELATIVE_SIGMA, Facing, check_facing, check_stated
 from scanner.calibration.problem import POSES, Problem, State, View
 from scanner.calibration.sheet import contradiction, stated_length
 from scanner.calibration.solve import Progress, Solution, SolveOptions, epipolar_errors, priors_of, solve
@@ -36,6 +36,9 @@ DISTORTED_PX = 0.1
 """Residual from which distortion is the likely cause: points are measured to some hundredths."""
 MOST_RMS_SHARE = 0.002
 """Of the picture's width that residuals may have: beyond, points and model do not belong together."""
+
+LEAST_ORIGIN = 0.01
+"""Of the distance: how far before or behind a lens the origin of a target's coordinates must lie for m34 = 1."""
 
 MOST_FOCAL_SPREAD = MOST_RELATIVE_SIGMA
 """1-sigma of a focal length, as a share, that a target in space may leave. What a lens's distortion adds is no noise,
@@ -75,7 +78,14 @@ def solve_hall(
     if len(chosen.view.ids) < FEWEST_DISCS:
         raise CalibrationError(f"{len(chosen.view.ids)} discs are seen, the Hall model is given {FEWEST_DISCS} or more")
     facing, _ = check_facing([chosen.view])
-    fit = _fitted(target, chosen.view)
+    fit, shifted = _fitted(target, chosen.view), []
+    if _origin_beside_a_lens(fit, target.points[fit.view.ids]):
+        target = replace(target, points=target.points - target.points.mean(axis=0))
+        fit = _fitted(target, chosen.view)
+        shifted = [
+            "the origin of the target's coordinates is beside a lens, where m34 = 1 of the Hall model cannot be: the "
+            "world's origin is the middle of the target's points instead"
+        ]
     state, world = _parts(fit, chosen)
     options = options or SolveOptions()
     length = stated_length(options.length, target)
@@ -84,8 +94,9 @@ def solve_hall(
     points = target.points[fit.view.ids]
     adjusted = _as_adjusted(state, problem, (fit.camera, fit.projector), [points])
     _check(adjusted, problem)
-    _check_depth(fit, points, float(state.poses[0, 5]))
-    warnings = _warnings(facing, adjusted)
+    _check_depth(fit, points, float(_depths(problem, state)[0].mean()), chosen.view.ids)
+    stated_off = check_stated(problem, state, options.baseline_mm, options.distance_mm)
+    warnings = [*shifted, *_warnings(facing, adjusted), *stated_off]
     if (contradicts := contradiction(problem, state)) is not None:
         warnings.append(contradicts.words)
     others = [LeftOut(one.view.name, "one capture is enough") for one in observations if one is not chosen]
@@ -200,21 +211,71 @@ def _warnings(facing: Facing | None, adjusted: Adjusted) -> list[str]:
     return found
 
 
-def _check_depth(fit: _Fit, points: Array, distance_mm: float) -> None:
-    """Raise where the target is too flat to tell focal length from distance."""
+def _origin_beside_a_lens(fit: _Fit, points: Array) -> bool:
+    """Whether the origin of the target's coordinates is about as deep as a lens: m34 = 1 is no scale for a matrix that
+    has 0 there (Casey 2011, eq. 3.8)."""
+    for matrix in (fit.camera, fit.projector):
+        if not np.isfinite(matrix).all():
+            return True
+        parts = decompose(matrix)
+        depth = float(np.median((points @ parts.rotation.T + parts.translation)[:, 2]))
+        if abs(parts.translation[2]) < LEAST_ORIGIN * abs(depth):
+            return True
+    return False
+
+
+def _depths(problem: Problem, state: State) -> list[Array]:
+    """By view, (n,) mm: how far before the camera the points are."""
+    return [
+        (problem.target.points[view.ids] @ rotation_of(pose[:3]).T + pose[3:])[:, 2]
+        for view, pose in zip(problem.views, state.poses, strict=True)
+    ]
+
+
+def _check_depth(fit: _Fit, points: Array, distance_mm: float, names: NDArray[np.int64]) -> None:
+    """Raise where the target is too flat to tell focal length from distance, or its points are not where they are
+    said to be. names: (n,) of the points."""
     for side, matrix, pixels in (
         ("camera", fit.camera, fit.view.camera),
         ("projector", fit.projector, fit.view.projector),
     ):
         unsure = focal_spread(matrix, points, pixels)
-        if not unsure <= MOST_FOCAL_SPREAD:
-            deep = float(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[2]) / np.sqrt(len(points))
+        if unsure <= MOST_FOCAL_SPREAD:
+            continue
+        left = _left(matrix, points, pixels)
+        known = f"the {side}'s focal length is known to {min(unsure, 9.99):.1%} only"
+        if (odd := _odd_one(points, pixels, left)) is not None:
             raise CalibrationError(
-                f"the target's depth is too small for the Hall model: its points lie within {deep:.1f} mm (rms) of a "
-                f"plane, {deep / distance_mm:.2%} of the distance, and the {side}'s focal length is known to "
-                f"{min(unsure, 9.99):.1%} only",
-                hint="use a deeper body, or several poses of a flat target",
+                f"disc {names[odd]}, from 0 on, is not where the target's file has it: with it {left:.2f} px are left "
+                f"in the {side}, and {known}",
+                hint="measure it again, and see that discs and points have the same order",
             )
+        if left > DISTORTED_PX:
+            raise CalibrationError(
+                f"the Hall model does not fit these points: {left:.2f} px are left in the {side}, and {known}",
+                hint="measure the discs' places again; a lens with distortion needs several poses of a flat target",
+            )
+        deep = float(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[2]) / np.sqrt(len(points))
+        raise CalibrationError(
+            f"the target's depth is too small for the Hall model: its points lie within {deep:.1f} mm (rms) of a "
+            f"plane, {deep / distance_mm:.2%} of the distance, and {known}",
+            hint="use a deeper body, or several poses of a flat target",
+        )
+
+
+def _left(matrix: Array, points: Array, pixels: Array) -> float:
+    """Rms distance, px."""
+    return float(np.sqrt(((project_hall(matrix, points) - pixels) ** 2).sum(axis=1).mean()))
+
+
+def _odd_one(points: Array, pixels: Array, left: float) -> int | None:
+    """Which point alone makes most of what is left: without it there is less than a third; None where none does."""
+    if len(points) < FEWEST_DISCS:
+        return None
+    others = ~np.eye(len(points), dtype=bool)
+    without = [_left(hall_matrix(points[kept], pixels[kept]), points[kept], pixels[kept]) for kept in others]
+    odd = int(np.argmin(without))
+    return odd if without[odd] < left / 3 else None
 
 
 def _check(adjusted: Adjusted, problem: Problem) -> None:
@@ -228,8 +289,7 @@ def _check(adjusted: Adjusted, problem: Problem) -> None:
                 f"the Hall model does not fit these points: {rms:.1f} px are left in the {side}",
                 hint="check the target's file against the target; a lens with strong distortion needs --model pinhole",
             )
-    depth = adjusted.state.poses[:, 5]
-    if (depth <= 0).any():
+    if any(float(np.median(depth)) <= 0 for depth in _depths(problem, adjusted.state)):
         raise CalibrationError(
             "the target comes out behind the camera: its picture is mirrored against its coordinates",
             hint="check the handedness of the target's file: x right, y down, z away from the viewer, or a turn of it",

@@ -135,7 +135,10 @@ def load_discs(path: Path) -> Target:
     if turned is not None:
         if len(turned) != len(points):
             raise ConfigError(f"target {path}: {len(turned)} normals for {len(points)} points")
-        turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        lengths = np.linalg.norm(turned, axis=1, keepdims=True)
+        if not lengths.all():
+            raise ConfigError(f"target {path}: normal {int(lengths.argmin())}, from 0 on, has no direction")
+        turned = turned / lengths
     diameter = content.get("diameter_mm", 0.0)
     if not isinstance(diameter, int | float) or not 0 < diameter < 1e4:
         raise ConfigError(f"target {path}: diameter_mm must be a length in mm, got {diameter!r}")
@@ -227,7 +230,7 @@ def _length(text: str, spec: str) -> float:
 def _vectors(content: Any, name: str) -> Array:
     try:
         array = np.asarray(content, dtype=np.float64)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise ConfigError(f"{name}: not a list of [x, y, z]") from error
     if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
         raise ConfigError(f"{name}: not a list of [x, y, z]")

@@ -220,12 +220,15 @@ def test_discs_on_a_line_are_refused(depth: float, tmp_path: Path) -> None:
 
 def test_target_files_that_are_none(tmp_path: Path) -> None:
     file = tmp_path / "wedge.json"
+    on_a_curve = [[20 * k, k * k, 0] for k in range(12)]
     for content, words in (
         ("{", "not JSON"),
         ('{"format": "x"}', "no fringed-target"),
         ('{"format": "fringed-target", "version": 1, "points": [[1, 2, 3]], "diameter_mm": 5}', "needs 12"),
         ('{"format": "fringed-target", "version": 1, "points": [[1, 2]]}', "list of"),
-        (json.dumps({**DISCS, "points": [[20 * k, k * k, 0] for k in range(12)] + [[42, 4, 0]]}), "points 2 and 12"),
+        (json.dumps({**DISCS, "points": [[10**400, 2, 3]] * 12}), "list of"),
+        (json.dumps({**DISCS, "points": on_a_curve, "normals": [[0, 0, 0]] * 12}), "normal 0, from 0 on, has no"),
+        (json.dumps({**DISCS, "points": [*on_a_curve, [42, 4, 0]]}), "points 2 and 12"),
     ):
         file.write_text(content)
         with pytest.raises(ConfigError, match=words) as refused:

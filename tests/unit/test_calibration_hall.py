@@ -160,3 +160,48 @@ def test_target_file_of_the_other_hand_is_refused(wedge: Target) -> None:
     left_handed = replace(wedge, points=wedge.points * (-1.0, 1.0, 1.0))
     with pytest.raises(CalibrationError, match="mirrored against its coordinates"):
         solve_hall(left_handed, seen(RIG, wedge))
+
+
+def _in_frame(wedge: Target, matrix: np.ndarray, shift: np.ndarray) -> Target:
+    """The wedge in other coordinates: `POSE` undone, then moved."""
+    return replace(wedge, points=wedge.points @ matrix.T + shift)
+
+
+def test_a_target_in_the_cameras_own_coordinates_is_moved_to_its_middle(wedge: Target) -> None:
+    """Where the origin is beside a lens no matrix has m34 = 1."""
+    turn = np.asarray(cv2.Rodrigues(POSE[:3])[0])
+    one = solve_hall(wedge, seen(RIG, wedge))
+    for shift in (0.0, 1.0, -1.0):
+        of_camera = _in_frame(wedge, turn, POSE[3:] + np.array([0, 0, shift]))
+        found = solve_hall(of_camera, seen(RIG, wedge))
+        assert found.state.translation == pytest.approx(one.state.translation, rel=1e-4, abs=0.05)
+        assert any("is beside a lens" in said for said in found.warnings)
+        assert np.isfinite(np.array(calibration_dict(found)["hall"]["camera"])).all()
+    found = solve_hall(_in_frame(wedge, turn, POSE[3:] + np.array([0, 0, 100.0])), seen(RIG, wedge))
+    assert found.state.translation == pytest.approx(one.state.translation, rel=1e-4, abs=0.05)
+    assert found.warnings == ()
+
+
+def test_the_other_hand_is_told_wherever_the_origin_is(wedge: Target) -> None:
+    for shift in (-3000.0, 3000.0):
+        left_handed = replace(wedge, points=wedge.points * (1.0, 1.0, -1.0) + [0, 0, shift])
+        with pytest.raises(CalibrationError, match="mirrored against its coordinates"):
+            solve_hall(left_handed, seen(RIG, wedge))
+
+
+def test_a_wedge_of_another_size_contradicts_what_was_entered(wedge: Target) -> None:
+    large = replace(wedge, points=wedge.points * 1.2)
+    for entered in (SolveOptions(baseline_mm=float(np.linalg.norm(RIG.translation))), SolveOptions(distance_mm=700.0)):
+        assert solve_hall(wedge, seen(RIG, wedge), entered).warnings == ()
+        with pytest.raises(CalibrationError, match="were entered"):
+            solve_hall(large, seen(RIG, wedge), entered)
+
+
+def test_a_disc_that_is_not_where_its_file_has_it_is_named(wedge: Target) -> None:
+    moved, noisy = wedge.points.copy(), wedge.points + np.random.default_rng(3).normal(0, 0.2, wedge.points.shape)
+    moved[7] += [1.5, 0.0, 0.0]
+    with pytest.raises(CalibrationError, match="disc 7, from 0 on, is not where"):
+        solve_hall(replace(wedge, points=moved), seen(RIG, wedge))
+    with pytest.raises(CalibrationError, match=r"does not fit these points: .* px are left") as refused:
+        solve_hall(replace(wedge, points=noisy), seen(RIG, wedge))
+    assert "measure the discs' places again" in str(refused.value.hint)
