@@ -263,10 +263,8 @@ def _warnings(solution: Solution) -> list[str]:
     warnings += oblong_pixels(problem, adjusted.state)
     if lacking := not_met(problem, adjusted.state):
         warnings.append(lacking)
-    dropped = sum(int((~k).sum()) for k in adjusted.kept)
-    total = sum(len(k) for k in adjusted.kept)
-    if dropped > 0.1 * total:
-        warnings.append(f"{dropped} of {total} points were left out as outliers")
+    if (left_out := _outliers(problem, adjusted)) is not None:
+        warnings.append(left_out)
     if (contradicts := contradiction(problem, adjusted.state)) is not None:
         warnings.append(contradicts.words)
     stretch = adjusted.state.sheet[:2] - 1
@@ -276,6 +274,18 @@ def _warnings(solution: Solution) -> list[str]:
             "measure it (--length)"
         )
     return warnings
+
+
+def _outliers(problem: Problem, adjusted: Adjusted) -> str | None:
+    """Points left out of the fit, where they are many, or discs, of which each was measured by itself."""
+    total, dropped = sum(len(k) for k in adjusted.kept), sum(int((~k).sum()) for k in adjusted.kept)
+    if dropped and not problem.target.flat:
+        discs = sorted({int(n) for view, k in zip(problem.views, adjusted.kept, strict=True) for n in view.ids[~k]})
+        return (
+            f"discs {', '.join(map(str, discs))}, from 0 on, were left out as outliers: they are not where the "
+            "target's file has them, or were hidden in part"
+        )
+    return f"{dropped} of {total} points were left out as outliers" if dropped > 0.1 * total else None
 
 
 def _bending(solution: Solution) -> list[str]:

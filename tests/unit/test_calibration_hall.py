@@ -202,6 +202,9 @@ def test_a_disc_that_is_not_where_its_file_has_it_is_named(wedge: Target) -> Non
     moved[7] += [1.5, 0.0, 0.0]
     with pytest.raises(CalibrationError, match="disc 7, from 0 on, is not where"):
         solve_hall(replace(wedge, points=moved), seen(RIG, wedge))
+    adjusted = solve(replace(wedge, points=moved), seen(RIG, wedge), SolveOptions())
+    assert any("discs 7, from 0 on, were left out as outliers" in said for said in adjusted.warnings)
+    assert not any("left out as outliers" in said for said in solve(wedge, seen(RIG, wedge), SolveOptions()).warnings)
     with pytest.raises(CalibrationError, match=r"does not fit these points: .* px are left") as refused:
         solve_hall(replace(wedge, points=noisy), seen(RIG, wedge))
     assert "measure the discs' places again" in str(refused.value.hint)
