@@ -17,6 +17,9 @@ PARAMETERS = frozenset(
 )
 """Names that a covariance may have"""
 
+MOST_SIGMA = {"f": 1e4, "c": 1e4, "k": 1e2, "p": 1e2, "rotation": 3.0, "translation": 1e5}
+"""1-sigma, px, 1, rad, mm, beyond which a parameter is not known at all, by the first letter of a lens's or the part"""
+
 ASYMMETRY = 1e-4
 """Of two sigmas' product: what numbers written with five digits differ by"""
 
@@ -56,7 +59,18 @@ def read_covariance(content: Any) -> Covariance | None:
     if matrix.shape != (len(names), len(names)):
         raise ValueError(f'"matrix" has shape {matrix.shape}, {len(names)} parameters are named')
     _require_covariance(matrix)
+    for name, sigma in zip(names, np.sqrt(np.diag(matrix)), strict=True):
+        part, member = name.split(".")
+        if sigma > MOST_SIGMA[part if part in MOST_SIGMA else member[0]]:
+            raise ValueError(f'"matrix" has a 1-sigma of {sigma:.2g} for {name}: nothing is known of it')
     return Covariance(tuple(names), matrix)
+
+
+def taken_as_exact(found: Covariance) -> list[str]:
+    """What a covariance does not name of what every rig has: focal lengths, principal points, the projector's place."""
+    needed = [f"{part}.{member}" for part in ("camera", "projector") for member in LENS_MEMBERS[:4]]
+    needed += [f"{part}.{member}" for part in ("rotation", "translation") for member in "xyz"]
+    return [name for name in needed if name not in found.names]
 
 
 def _require_covariance(matrix: NDArray[np.float64]) -> None:

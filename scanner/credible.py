@@ -59,11 +59,12 @@ def lens_warnings(lens: Lens, name: str) -> list[str]:
         CalibrationError: it can be none.
     """
     said = []
+    if max(lens.size) > MOST_PX:
+        given = f"{list(lens.size)}"
+        raise CalibrationError(f"{name}.size {given:.80} is no picture's", hint="width and height in pixels")
     for n, focal, across in zip(lens.size, (lens.matrix[0, 0], lens.matrix[1, 1]), ("across", "down"), strict=True):
         field = 2 * math.degrees(math.atan(n / 2 / focal))
         words = f"{name}.matrix: a focal length of {focal:g} px is an angle of view of {field:.3g} degrees {across}"
-        if n > MOST_PX:
-            raise CalibrationError(f"{name}.size {list(lens.size)} is no picture's", hint="width and height in pixels")
         if field > MOST_FIELD_DEG:
             raise CalibrationError(words, hint="focal lengths are in pixels; one in mm is divided by the pixel's size")
         said += [] if ODD_FIELD_DEG[0] <= field <= ODD_FIELD_DEG[1] else [words]

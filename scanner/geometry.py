@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from scanner.bounded_files import read_small_text
 from scanner.calibration_id import content_id, id_warnings
-from scanner.covariance import read_covariance
+from scanner.covariance import read_covariance, taken_as_exact
 from scanner.credible import check_hall, check_response, check_slope, lens_warnings, pixel_warnings, rig_warnings
 from scanner.errors import CalibrationError
 from scanner.kernel import kernel
@@ -289,7 +289,7 @@ def _lens(content: Any, name: str) -> Lens:
         raise CalibrationError(f"{name} is missing", hint=_MAKE)
     size = content.get("size")
     if not (isinstance(size, list) and len(size) == 2 and all(type(n) is int and n > 0 for n in size)):
-        raise CalibrationError(f"{name}.size must be [width, height] in pixels, got {size!r}")
+        raise CalibrationError(f"{name}.size must be [width, height] in pixels, got {size!r:.80}")
     matrix = _matrix(content.get("matrix"), (3, 3), f"{name}.matrix")
     if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or abs(np.linalg.det(matrix)) < 1e-9:
         raise CalibrationError(
@@ -308,12 +308,15 @@ def _lens(content: Any, name: str) -> Lens:
 def _covariance_warnings(content: Mapping[str, Any], name: str) -> list[str]:
     """A calibration without its covariance measures as well: what is missing is what it says of its own error."""
     try:
-        read_covariance(content.get("covariance"))
+        found = read_covariance(content.get("covariance"))
     except ValueError as error:
         return [
             f"{name}: covariance cannot be read: {error}. What the calibration adds to the uncertainty of scans is "
             "not known and missing from their budgets"
         ]
+    missing = [] if found is None else taken_as_exact(found)
+    if missing:
+        return [f"{name}: covariance says nothing of {', '.join(missing)}: scans' budgets take these as exact"]
     return []
 
 

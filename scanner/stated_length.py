@@ -14,6 +14,9 @@ from scanner.digits import with_uncertainty
 DOMINANT = 0.5
 """Share of a variance beyond which all other causes together weigh less: nothing else is worth mending first."""
 
+MOST_MM = 1e9
+"""A thousand kilometres: what is longer is no length of a target"""
+
 
 @dataclass(frozen=True)
 class StatedLength:
@@ -36,7 +39,9 @@ def stated_length_of(scale: Any) -> StatedLength | None:
     if not isinstance(scale, Mapping):
         return None
     reference, sigma = scale.get("reference_mm"), scale.get("sigma_mm")
-    if not (isinstance(reference, int | float) and isinstance(sigma, int | float) and reference > 0 and sigma > 0):
+    if not (isinstance(reference, int | float) and isinstance(sigma, int | float)):
+        return None
+    if not (0 < reference < MOST_MM and 0 < sigma < MOST_MM):
         return None
     return StatedLength(float(reference), float(sigma))
 

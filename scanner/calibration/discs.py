@@ -31,6 +31,9 @@ PASSES = 3
 MOST_MISFIT = 0.15
 """Of rim points from their ellipse, as a share of its radius (median): beyond, it is no disc."""
 LEAST_RADIUS_PX = 2.5
+MOST_OTHER_SIZE = 1.15
+"""By which discs may be larger or smaller than stated (median): a twentieth is what blur, light and a rough shape make;
+the correction for perspective goes with the square of it."""
 MOST_BLOBS = 45
 """Of a picture in which discs in space are looked for: all threes of more take seconds."""
 NEAR_SHARE = 0.35
@@ -58,10 +61,12 @@ def detect_circles(picture: NDArray[np.float32], grey: NDArray[np.uint8], target
     affine = _local_affine(homography, target.points[:, :2])
     shapes = affine * (target.diameter_mm / 2)
     spacing = np.linalg.norm(affine[:, :, 0], axis=1) * target.spacing_mm
-    measured = disc_centres(picture, points, shapes)
+    measured, radii = measured_discs(picture, points, shapes)
     kept = np.isfinite(measured).all(axis=1)
     if kept.sum() < 0.7 * len(points):
         return f"{int(kept.sum())} of {len(points)} circles are sharp enough to be measured"
+    if (other := _of_other_size(radii[kept], shapes[kept], target)) is not None:
+        return other
     return np.flatnonzero(kept).astype(np.int64), measured[kept], spacing[kept]
 
 
@@ -92,15 +97,33 @@ def detect_discs(picture: NDArray[np.float32], grey: NDArray[np.uint8], target: 
     near = off.min(axis=1) < NEAR_SHARE * spacing
     ids = np.flatnonzero(near).astype(np.int64)
     shapes = np.tile(affine[:, :2] * (target.diameter_mm / 2), (len(ids), 1, 1))
-    measured = disc_centres(picture, blobs[off.argmin(axis=1)[near]], shapes)
+    measured, radii = measured_discs(picture, blobs[off.argmin(axis=1)[near]], shapes)
     kept = np.isfinite(measured).all(axis=1)
     if kept.sum() < FEWEST_DISCS:
         return f"{int(kept.sum())} of the target's {len(flat)} discs are sharp enough to be measured"
+    if (other := _of_other_size(radii[kept], shapes[kept], target)) is not None:
+        return other
     return ids[kept], measured[kept], np.full(int(kept.sum()), spacing)
 
 
+def _of_other_size(radii: Array, shapes: Array, target: Target) -> str | None:
+    """In words, where discs are not as large as stated. radii: (N,) px; shapes: see `measured_discs`."""
+    ratio = float(np.median(radii / np.sqrt(np.abs(np.linalg.det(shapes)))))
+    if 1 / MOST_OTHER_SIZE < ratio < MOST_OTHER_SIZE:
+        return None
+    return (
+        f"the target's discs are {ratio * target.diameter_mm:.3g} mm across in the picture, measured by their "
+        f"distances, and {target.diameter_mm:g} mm by its description"
+    )
+
+
 def disc_centres(picture: NDArray[np.float32], points: Array, shapes: Array) -> Array:
-    """Centres of the ellipses that discs are seen as.
+    """(N, 2) px, centres of the ellipses that discs are seen as; arguments as of `measured_discs`."""
+    return measured_discs(picture, points, shapes)[0]
+
+
+def measured_discs(picture: NDArray[np.float32], points: Array, shapes: Array) -> tuple[Array, Array]:
+    """Centres and sizes of the ellipses that discs are seen as.
 
     Args:
         picture: (H, W) grey levels.
@@ -108,11 +131,11 @@ def disc_centres(picture: NDArray[np.float32], points: Array, shapes: Array) -> 
         shapes: (N, 2, 2) px: the unit circle's image, as a rough ellipse.
 
     Returns:
-        (N, 2) px, NaN where no ellipse fits.
+        (N, 2) px, centres; (N,) px, radii of circles of the same area; NaN where no ellipse fits.
     """
     angles = 2 * np.pi * np.arange(RAYS) / RAYS
     circle = np.column_stack((np.cos(angles), np.sin(angles)))
-    found = np.full((len(points), 2), np.nan)
+    found, radii = np.full((len(points), 2), np.nan), np.full(len(points), np.nan)
     for i, (point, shape) in enumerate(zip(points, shapes, strict=True)):
         centre, axes = point, shape
         for _ in range(PASSES):
@@ -125,8 +148,8 @@ def disc_centres(picture: NDArray[np.float32], points: Array, shapes: Array) -> 
             continue
         radius = np.linalg.norm(np.linalg.solve(axes, (rim - centre).T), axis=0)
         if np.median(np.abs(radius - 1)) < MOST_MISFIT:
-            found[i] = centre
-    return found
+            found[i], radii[i] = centre, np.sqrt(abs(np.linalg.det(axes)))
+    return found, radii
 
 
 def fit_ellipse(points: Array) -> tuple[Array, Array] | None:

@@ -218,6 +218,17 @@ def test_discs_on_a_line_are_refused(depth: float, tmp_path: Path) -> None:
     assert "lie on one line" in found.reason
 
 
+@pytest.mark.parametrize("spec", ["circles:7x5:32:{}", "acircles:4x9:20:{}"])
+def test_circles_of_another_size_than_stated_are_told(spec: str) -> None:
+    """The correction for perspective goes with the square of it."""
+    picture = drawn(parse_target(spec.format(18)))
+    assert isinstance(detect(picture, parse_target(spec.format(19))), Detection)
+    for stated in (14, 24):
+        found = detect(picture, parse_target(spec.format(stated)))
+        assert isinstance(found, NotFound)
+        assert re.search(rf"discs are (17\.\d|18|18\.\d) mm across .* and {stated} mm by its", found.reason)
+
+
 def test_target_files_that_are_none(tmp_path: Path) -> None:
     file = tmp_path / "wedge.json"
     on_a_curve = [[20 * k, k * k, 0] for k in range(12)]

@@ -159,6 +159,7 @@ SOUND = np.diag([4.0, 0.01, 0.02]) + np.array([[0, 0.1, 0], [0.1, 0, 0], [0, 0, 
         ({"parameters": NAMES, "matrix": (np.ones((3, 3)) - np.eye(3)).tolist()}, "no variance"),
         ({"parameters": ["camera.zoom"], "matrix": [[1.0]]}, "camera.zoom"),
         ({"parameters": ["camera.fx"] * 2, "matrix": [[1.0, 0], [0, 1.0]]}, "twice"),
+        ({"parameters": NAMES, "matrix": (1e30 * SOUND).tolist()}, "nothing is known of it"),
         ({"parameters": 5, "matrix": [[1.0]]}, "parameters"),
         ([1, 2], "object"),
     ],
@@ -180,7 +181,14 @@ def test_a_covariance_that_is_none_is_said_and_the_budget_names_what_is_missing(
 
 def test_a_sound_covariance_passes_and_counts(content: Content, ball: Any) -> None:
     rig = calibration_from_dict({**content, "covariance": {"parameters": NAMES, "matrix": SOUND.tolist()}})
-    assert rig.warnings == ()
+    (warning,) = rig.warnings
+    assert "says nothing of camera.fy, camera.cx" in warning
+    assert warning.endswith("rotation.z, translation.z: scans' budgets take these as exact")
+    names = [*NAMES, *warning.partition(" of ")[2].partition(":")[0].split(", ")]
+    whole = np.zeros((len(names), len(names)))
+    whole[: len(NAMES), : len(NAMES)] = SOUND
+    complete = {"parameters": names, "matrix": whole.tolist()}
+    assert calibration_from_dict({**content, "covariance": complete}).warnings == ()
     assert 0 < (depth_spread(rig, build_scan(ball.decoded(0.02), rig), "y") or 0) < 5
 
 
