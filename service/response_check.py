@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from scanner.calibration.grey_levels import LevelResponse
-from scanner.calibration.response import BIAS, Response
+from scanner.calibration.response import Response
 from scanner.digits import with_uncertainty
 
 
@@ -26,7 +26,7 @@ def checked(found: Response, levels: LevelResponse | None) -> tuple[dict[str, An
     unsure = found.expanded
     seen = (
         f"response by the target's fringes, a check: light follows what is projected to the power of "
-        f"{with_uncertainty(found.exponent, unsure)} (k = 2, {BIAS:.0%} of it for blur)"
+        f"{with_uncertainty(found.exponent, unsure)} (k = 2)"
     )
     if levels is not None:
         return None, (f"{seen}; the file has what grey levels told", *_against_levels(found, levels, unsure))

@@ -28,6 +28,23 @@ LEAST_CONTRAST = 0.05
 LIT_SHARE = 0.25
 """Of the contrast of the brightest pixels: what has less is lit by the rest of the room"""
 
+LEAST_APART = 0.02
+"""Of white: what two showings of a level may differ by in any case"""
+
+MOST_APART = 0.7
+"""The same, as a share of the step to the next level: a frame that is out of step shows that one, a whole step off"""
+
+ODD_TIMES = 8.0
+"""The same, over what the others differ by (median), as shares of their light: a lamp flickers at all levels, and
+chance goes so far once in ten million"""
+
+MOST_UNSTEADY = 0.1
+"""Of their light, the median of the levels: more is no lamp's flicker"""
+
+CLIPPED_SHARE = 0.05
+"""Of lit pixels: so many that are the brightest there are, and no brighter at white than a level before, have reached
+what the camera can give; others rise by several grey levels"""
+
 LEAST_SIGMA = 1e-4
 """Of an exponent: a calibration file has it in four decimals"""
 
@@ -119,6 +136,7 @@ def response_of_levels(
         raise CalibrationError(
             "too few pixels are lit without clipping", hint="expose shorter: white must stay below the camera's range"
         )
+    _refuse_clipped(means[:, use], steps)
     weight = contrast[use] / float(contrast[use] @ contrast[use])
     shots = np.array([(np.asarray(frame, np.float64)[use] - means[0, use]) @ weight for frame in frames])
     shown = np.array([np.count_nonzero(values == v) for v in steps])
@@ -129,6 +147,7 @@ def response_of_levels(
             f"level {steps[falls[0] + 1]} is darker than level {steps[falls[0]]}",
             hint="are the frames in the order of their levels? Switch dynamic contrast off",
         )
+    _refuse_out_of_step(steps, light, values, shots)
     light = np.clip(np.maximum.accumulate(light), 0, 1)
     # Rounding is averaged over pixels only where noise or texture dithers it: it is taken as the same in all.
     gamma, sigma, misfit = _exponent(steps, light, float(1 / np.sqrt(12 * np.mean(contrast[use] ** 2))))
@@ -139,6 +158,36 @@ def response_of_levels(
         gamma, sigma, misfit, tuple(float(v) for v in table), tuple(int(v) for v in steps),
         tuple(float(v) for v in light), int(np.count_nonzero(use)), unsteady, chance,
     )  # fmt: skip
+
+
+def _refuse_clipped(means: NDArray[np.float64], steps: NDArray[Any]) -> None:
+    """Raise CalibrationError where lit pixels, (L, n) at each level, end below full scale."""
+    still = (means[-1] == means[-2]) & (means[-1] > means[0]) & (means[-1] > means[-1].max() - 1)
+    if np.mean(still) > CLIPPED_SHARE:
+        raise CalibrationError(
+            f"{np.mean(still):.0%} of the lit pixels are as bright at level {steps[-2]} as at {steps[-1]}, at grey "
+            f"level {np.median(means[-1][still]):g}: the camera clips there",
+            hint="expose shorter: white must stay below the camera's range",
+        )
+
+
+def _refuse_out_of_step(
+    steps: NDArray[Any], light: NDArray[np.float64], values: NDArray[Any], shots: NDArray[np.float64]
+) -> None:
+    """Raise CalibrationError where one showing of a level looks like another level's. light: (L,) mean of its shots."""
+    apart = np.array([np.ptp(shots[values == v]) for v in steps])
+    rises = np.abs(np.diff(light))
+    nearest = np.minimum(np.append(rises, np.inf), np.insert(rises, 0, np.inf))
+    share = apart / np.maximum(light, LEAST_APART)
+    usual = float(np.median(share[light > LEAST_APART]))
+    far = apart > np.maximum(LEAST_APART, MOST_APART * nearest)
+    odd = np.flatnonzero(far & ((share > ODD_TIMES * usual) | (usual > MOST_UNSTEADY)))
+    if odd.size:
+        raise CalibrationError(
+            f"level {steps[odd[0]]} was seen with lights that are {apart[odd[0]]:.1%} of white apart, as if another "
+            "level had been shown",
+            hint="frames out of step (fringed calibrate sync), or a light that flickers: measure again",
+        )
 
 
 def _unsteadiness(values: NDArray[Any], shots: NDArray[np.float64]) -> float | None:

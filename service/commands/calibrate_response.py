@@ -175,10 +175,7 @@ def _facts(found: LevelResponse | Response) -> list[tuple[str, str]]:
         projected = "" if found.gamma is None else with_uncertainty(found.gamma, share * found.gamma)
         return [
             ("exponent", f"{exponent} (k = 2) left in this capture (1: the light is linear)"),
-            (
-                "+-",
-                f"{BIAS:.0%} of it, by which blur draws an exponent towards 1, and noise; grey levels know it better",
-            ),
+            ("+-", f"noise, and {BIAS:.0%} of it{_pulled(found)}; grey levels tell any response"),
             ("ripple", f"{found.ripple_px:.3f} projector px rms in this capture"),
             ("misfit", f"{found.misfit_before:.2%} of the fringes, {found.misfit_after:.2%} with this exponent"),
             ("gamma to undo", projected or "the table used, followed by light ^ (1 / exponent)"),
@@ -194,6 +191,14 @@ def _facts(found: LevelResponse | Response) -> list[tuple[str, str]]:
         ("gamma", f"{gamma} (k = 2), with {found.misfit:.2%} of white left: {fits}"),
         ("levels", f"{len(found.levels)}, seen by {found.pixels:,} pixels; {steady}"),
     ]
+
+
+def _pulled(found: Response) -> str:
+    from scanner.calibration.response import PULL  # noqa: PLC0415
+
+    if not found.blurred:
+        return ""
+    return f" and {PULL:.0%} of its distance from 1, to which blur draws it: one frequency cannot tell blur"
 
 
 def _where(of_projector: dict[str, Any] | None, written: Path | None) -> str:

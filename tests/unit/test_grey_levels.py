@@ -99,6 +99,21 @@ def test_light_that_is_not_steady_is_told_from_a_response_that_is_no_exponent():
     assert response_of_levels(LEVELS, shots(bent), 255).unsteady is None
 
 
+def test_a_level_that_was_shown_as_another_once_is_told():
+    twice = (*LEVELS, *LEVELS[::-1])
+    for gamma, late in ((1.0, 12), (2.2, 14), (2.2, 25)):
+        frames = shots(lambda v, g=gamma: (v / 255) ** g, twice)
+        frames[late] = frames[late - 1]
+        with pytest.raises(CalibrationError, match=f"level {twice[late]} was seen with lights that are .* apart"):
+            response_of_levels(twice, frames, 255)
+
+
+def test_a_camera_that_clips_below_full_scale_is_told():
+    frames = [np.minimum(frame, 150) for frame in shots(lambda v: (v / 255) ** 1.5)]
+    with pytest.raises(CalibrationError, match="at grey level 150: the camera clips there"):
+        response_of_levels(LEVELS, frames, 255)
+
+
 @pytest.mark.parametrize(
     ("levels", "response", "said"),
     [

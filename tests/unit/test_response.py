@@ -23,14 +23,17 @@ def rows_seen():
     return 10 + 215 * y + 6 * np.sin(5 * x)
 
 
-def shown(sequence, exponent, noise=0.7, seed=3):
-    """Frames of a board under light ^ exponent."""
+def shown(sequence, exponent, noise=0.7, seed=3, blur=0.0):
+    """Frames of a board under light ^ exponent, blurred (1-sigma, projector px)."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(9)
     random = np.random.default_rng(seed)
     pattern, rows, frames = sequence.pattern, rows_seen(), []
     for f, shifts in zip(pattern.frequencies, pattern.shifts, strict=True):
         for n in range(shifts):
             angle = 2 * np.pi * f * (rows + pattern.origin) / PROJECTOR.height - 2 * np.pi * n / shifts
-            grey = 8 + 190 * (0.5 + 0.48 * np.cos(angle)) ** exponent + random.normal(0, noise, CAMERA.shape)
+            around = angle[..., None] + 2 * np.pi * f * blur * nodes / PROJECTOR.height
+            light = (0.5 + 0.48 * np.cos(around)) ** exponent @ (weights / weights.sum())
+            grey = 8 + 190 * light + random.normal(0, noise, CAMERA.shape)
             frames.append(np.rint(np.clip(grey, 0, 255)).astype(np.uint8))
     return frames
 
@@ -44,6 +47,30 @@ def test_the_exponent_is_found_again(exponent, shifts):
     assert found.sigma < 0.02
     assert found.gamma == pytest.approx(found.exponent)
     assert found.misfit_after <= found.misfit_before + 1e-6
+
+
+@pytest.mark.parametrize(("exponent", "shifts"), [(0.4, 3), (0.8, 8), (1.0, 3), (1.3, 4), (2.6, 8)])
+def test_blur_draws_no_exponent_towards_1(exponent, shifts):
+    """It takes more from overtones than from fringes, and more from fine fringes than from coarse ones."""
+    sequence = PatternSequence(PROJECTOR, PmpPattern(("y",), (1.0, 8.0, 24.0), (shifts,) * 3))
+    found = response_of_frames(sequence, CAMERA, shown(sequence, exponent, blur=1.4))
+    assert found.exponent == pytest.approx(exponent, abs=found.expanded)
+    assert found.expanded < 0.03 * exponent
+    assert not found.blurred
+
+
+def test_one_frequency_cannot_tell_blur_and_says_so():
+    sequence = PatternSequence(PROJECTOR, PmpPattern(("y",), (1.0,), (8,)))
+    found = response_of_frames(sequence, CAMERA, shown(sequence, 1.5))
+    assert found.blurred
+    assert found.expanded > 0.15
+    assert found.exponent == pytest.approx(1.5, abs=found.expanded)
+
+
+def test_an_exponent_beyond_what_fringes_tell_is_refused():
+    sequence = PatternSequence(PROJECTOR, PmpPattern(("y",), (1.0, 8.0), (8, 8)))
+    with pytest.raises(CalibrationError, match="lies beyond"):
+        response_of_frames(sequence, CAMERA, shown(sequence, 0.15))
 
 
 def test_the_ripple_is_the_error_that_the_response_has_made():
