@@ -21,7 +21,7 @@ from scanner.calibration.held_out import HeldOut
 from scanner.calibration.lens_slopes import rotation_of, vector_of
 from scanner.calibration.observe import LeftOut, Observation, warm_up_of, warnings_of
 from scanner.calibration.plausibility import MOST_RELATIVE_SIGMA, Facing, check_facing, check_stated
-from scanner.calibration.problem import POSES, Problem, State, View
+from scanner.calibration.problem import POSES, Problem, State, View, sheet_points
 from scanner.calibration.sheet import contradiction, stated_length
 from scanner.calibration.solve import Progress, Solution, SolveOptions, epipolar_errors, priors_of, solve
 from scanner.calibration.targets import FEWEST_DISCS, Target
@@ -94,7 +94,7 @@ def solve_hall(
     points = target.points[fit.view.ids]
     adjusted = _as_adjusted(state, problem, (fit.camera, fit.projector), [points])
     _check(adjusted, problem)
-    _check_depth(fit, points, float(_depths(problem, state)[0].mean()), chosen.view.ids)
+    _check_depth(fit, points, float(_in_space(problem, state)[0][:, 2].mean()), chosen.view.ids)
     stated_off = check_stated(problem, state, options.baseline_mm, options.distance_mm)
     warnings = [*shifted, *_warnings(facing, adjusted), *stated_off]
     if (contradicts := contradiction(problem, state)) is not None:
@@ -122,10 +122,7 @@ def solve_hall(
 def _of_poses(solution: Solution) -> Solution:
     """The Hall matrices of a solution from flat targets."""
     problem, state = solution.problem, solution.state
-    space = [
-        problem.target.points[view.ids] @ rotation_of(pose[:3]).T + pose[3:]
-        for view, pose in zip(problem.views, state.poses, strict=True)
-    ]
+    space = _in_space(problem, state)
     every = np.concatenate(space)
     camera = hall_matrix(every, np.concatenate([view.camera for view in problem.views]))
     projector = hall_matrix(every, np.concatenate([view.projector for view in problem.views]))
@@ -224,10 +221,11 @@ def _origin_beside_a_lens(fit: _Fit, points: Array) -> bool:
     return False
 
 
-def _depths(problem: Problem, state: State) -> list[Array]:
-    """By view, (n,) mm: how far before the camera the points are."""
+def _in_space(problem: Problem, state: State) -> list[Array]:
+    """By view, (n, 3) mm: the points of the target's sheet, as it came out, in the camera's frame."""
+    points = sheet_points(problem.target, state.sheet)[0]
     return [
-        (problem.target.points[view.ids] @ rotation_of(pose[:3]).T + pose[3:])[:, 2]
+        points[view.ids] @ rotation_of(pose[:3]).T + pose[3:]
         for view, pose in zip(problem.views, state.poses, strict=True)
     ]
 
@@ -289,7 +287,7 @@ def _check(adjusted: Adjusted, problem: Problem) -> None:
                 f"the Hall model does not fit these points: {rms:.1f} px are left in the {side}",
                 hint="check the target's file against the target; a lens with strong distortion needs --model pinhole",
             )
-    if any(float(np.median(depth)) <= 0 for depth in _depths(problem, adjusted.state)):
+    if any(float(np.median(points[:, 2])) <= 0 for points in _in_space(problem, adjusted.state)):
         raise CalibrationError(
             "the target comes out behind the camera: its picture is mirrored against its coordinates",
             hint="check the handedness of the target's file: x right, y down, z away from the viewer, or a turn of it",

@@ -131,6 +131,19 @@ def test_flat_targets_give_matrices_too() -> None:
     assert content["residuals"]["projector_px"] < 0.06
 
 
+def test_flat_targets_count_with_the_size_that_they_came_out_with() -> None:
+    """A print that is larger than it is called: the length that was measured on it makes the scale."""
+    print_scale = 1.01
+    seen_larger = observations(RIG, poses(6), sheet=(print_scale, print_scale, 1.0))
+    length = TARGET.longest_mm * print_scale
+    options = SolveOptions(length=(length, 0.001))
+    hall, adjusted = (solver(TARGET, seen_larger, options) for solver in (solve_hall, solve))
+    assert hall.state.sheet[0] == pytest.approx(print_scale, abs=3e-4)
+    assert hall.state.translation == pytest.approx(adjusted.state.translation, abs=0.3)
+    assert np.linalg.norm(hall.state.translation) == pytest.approx(np.linalg.norm(RIG.translation), rel=1e-3)
+    assert calibration_dict(hall)["residuals"]["camera_px"] < 0.05
+
+
 def test_too_few_discs_and_no_capture_are_refused(wedge: Target) -> None:
     one = seen(RIG, wedge)[0]
     few = replace(one, view=one.view.only(np.arange(18) < 10))
