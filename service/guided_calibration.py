@@ -98,9 +98,26 @@ class GuidedCalibration:
 
     def take_up(self) -> int:
         """Look at the poses that the folder holds; how many serve."""
+        poses = self._folder / POSES
         for path in self.captures:
-            self._keep(observe_capture(path, path.name, self.target))
+            self._keep(observe_capture(path, path.relative_to(poses).as_posix(), self.target))
         return len(self.observations)
+
+    def require_this_rig(self) -> None:
+        """Raise CalibrationError where poses are of a rig with other devices than are here."""
+        self._client.preview_start(rate_hz=PREVIEW_HZ, max_width=PREVIEW_WIDTH)  # opens the devices
+        devices = self._client.status()["devices"]
+        if devices is None:
+            return
+        here = tuple((devices[side]["width"], devices[side]["height"]) for side in ("camera", "projector"))
+        for one in self.observations:
+            there = (one.camera_size, one.projector_size)
+            if there != here:
+                sizes = [f"camera {c[0]} x {c[1]}, projector {p[0]} x {p[1]}" for c, p in (there, here)]
+                raise CalibrationError(
+                    f"pose {one.view.name} of {self._folder} is another rig's: {sizes[0]}, and this one has {sizes[1]}",
+                    hint="give another -o DIR: a new one, or that of this rig's earlier run",
+                )
 
     def capture(self, on_event: OnEvent | None = None) -> tuple[bool, str]:
         """Capture the pose that stands there: whether it serves, and in words how good it is or why it does not.
@@ -108,8 +125,7 @@ class GuidedCalibration:
         Raises:
             ScannerError: the scan failed, otherwise than by the pose.
         """
-        number = max((int(path.name) for path in self.captures if path.name.isdigit()), default=0) + 1
-        place, incoming = self._folder / POSES / f"{number:02d}", self._folder / INCOMING
+        place, incoming = self._free_place(), self._folder / INCOMING
         try:
             job = self._client.start_scan("pmp", pattern={"axes": ["x", "y"]})
             try:
@@ -131,6 +147,12 @@ class GuidedCalibration:
             return False, outcome.reason
         self._keep(outcome)
         return True, self._quality()
+
+    def _free_place(self) -> Path:
+        """Of the next pose: behind all that stands there, whatever it is."""
+        poses = self._folder / POSES
+        taken = [int(path.name) for path in poses.iterdir() if path.name.isdecimal()] if poses.is_dir() else []
+        return poses / f"{max(taken, default=0) + 1:02d}"
 
     def undo(self) -> str | None:
         """Take the last pose back, with its folder; its name, or None where there is none."""

@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 FORMAT, VERSION = "fringed-marks", 1
 FEWEST_MARKS = 3
 MOST_MARKS = 100
+MOST_RADIUS_PX = 1e4
 WINDOW_PX = 60
 """Half width of the window in which a mark is looked for the first time; later three of its radii."""
 GROUND = 2.0
@@ -37,6 +38,9 @@ IN_LINE = 0.05
 AREA_RATIO = 1.3
 """By which a mark's area in the picture may differ from the reference's: one that is ten pixels across, and whose edge
 another exposure moves by half a pixel. Of one that is smaller a part is hidden."""
+TURN_SIGMAS = 4.0
+"""By which a plate must have turned beyond noise: neighbouring points err alike, so that noise turns it by some more
+than it is taken for."""
 UNIT = 1e-3
 """By which a normal's length in a file may differ from 1."""
 NOTABLE_SHARE = 1e-4
@@ -133,8 +137,8 @@ def measured_marks(marks: Marks, albedo: NDArray[Any], xyz: NDArray[Any]) -> dic
 
     `points`: for each its movement, mm, or None where it is hidden; `rms_mm`, `largest_mm` over those seen;
     `as_a_whole_mm`, `shape_mm`: the mean movement, and what is left after the best turn and shift of three or more;
-    `scale_ppm`: how much their distances have grown. `plate`: offset along its normal, mm, turn, mrad, and by how much
-    the edge of what is seen of it has moved at most, mm.
+    `scale_ppm`: how much their distances have grown. `plate`: offset along its normal, mm, turn, mrad, and what
+    both do at the edge of what is scanned, mm, without what noise turns it by.
     `allowed_mm`, and `warning`, None or in words.
     """
     each, before, now = [], [], []
@@ -185,8 +189,14 @@ def parse_marks(content: Any, name: str) -> Marks:
         raise CalibrationError(f"{name}: points or plate are not as they should be ({error!r})") from error
     numbers = [value for mark in points for value in (*mark.at, mark.radius_px, *mark.xyz)]
     numbers += [*plate.point, *plate.normal] if plate is not None else []
-    if not np.isfinite(numbers).all() or len(points) > MOST_MARKS or any(mark.radius_px <= 0 for mark in points):
-        raise CalibrationError(f"{name}: points must be finite, {MOST_MARKS} at most, their radii positive")
+    if (
+        not np.isfinite(numbers).all()
+        or len(points) > MOST_MARKS
+        or not all(0 < mark.radius_px < MOST_RADIUS_PX for mark in points)
+    ):
+        raise CalibrationError(
+            f"{name}: points must be finite, {MOST_MARKS} at most, their radii 0 .. {MOST_RADIUS_PX:g} px"
+        )
     if plate is not None and (min(plate.region[2:]) < 1 or abs(float(np.linalg.norm(plate.normal)) - 1) > UNIT):
         raise CalibrationError(f"{name}: a plate needs a region of some width and height, and a normal of length 1")
     if any(np.linalg.norm(np.subtract(a.xyz, b.xyz)) == 0 for a, b in combinations(points, 2)):
@@ -280,11 +290,20 @@ def _plate_moved(plate: Plate, xyz: NDArray[Any]) -> dict[str, Any]:
         return {"offset_mm": None, "turn_mrad": None, "edge_mm": None, "why": str(error)}
     offset = float((np.array(plate.point) - point) @ normal)
     turn = float(np.arcsin(min(float(np.linalg.norm(np.cross(plate.normal, normal))), 1.0)))
-    part = _part(xyz, plate.region)
-    away = np.linalg.norm(part[np.isfinite(part[..., 2])] - point, axis=-1)
-    # What is seen of it, without a few points that are wrong.
-    edge = abs(offset) + turn * float(np.percentile(away, 95))
-    return {"offset_mm": -offset, "turn_mrad": 1e3 * turn, "edge_mm": edge}
+    there = xyz[np.isfinite(xyz[..., 2])]
+    # A rig that turned the plate has turned all that it scans; without a few points that are wrong.
+    reach = float(np.percentile(np.linalg.norm(there - point, axis=-1), 95))
+    sure = max(turn - TURN_SIGMAS * _turn_sigma(_part(xyz, plate.region), point, normal), 0.0)
+    return {"offset_mm": -offset, "turn_mrad": 1e3 * turn, "edge_mm": abs(offset) + sure * reach}
+
+
+def _turn_sigma(part: NDArray[Any], point: Array, normal: Array) -> float:
+    """Rad that noise turns a plate's normal by, 1-sigma, here and in the reference alike."""
+    points = part[np.isfinite(part[..., 2])] - point
+    off = points @ normal
+    noise = 1.4826 * float(np.median(np.abs(off - np.median(off))))
+    across = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]
+    return float(np.sqrt(2) * noise / across)
 
 
 def _movement(before: Array, now: Array) -> dict[str, Any]:

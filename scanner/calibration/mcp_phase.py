@@ -153,7 +153,10 @@ _SCAN_AGAIN = (
 
 def _on_measured(rows: NDArray[Any], peaks: NDArray[Any]) -> tuple[Array, Array]:
     """Stripe index, and PMP's row, of every peak of a whole stripe that lies on pixels that PMP measured."""
-    whole = peaks[np.asarray(peaks[:, 3]) == np.round(peaks[:, 3])].astype(np.float64)
+    sound = np.isfinite(peaks[:, :4]).all(axis=1) & (np.asarray(peaks[:, 3]) == np.round(peaks[:, 3]))
+    whole = peaks[sound].astype(np.float64)
+    if not len(whole):
+        return np.empty(0), np.empty(0)
     x, y = (whole[:, k].astype(np.float32) for k in (0, 1))
     seen = cv2.remap(np.asarray(rows, np.float32), x[:, None], y[:, None], cv2.INTER_LINEAR, borderValue=float("nan"))[
         :, 0
@@ -212,8 +215,8 @@ def _whole(off: Array, pitch_px: float) -> NDArray[np.bool_]:
 
 class _Spreads:
     """U of a line's figures, by how much stripes as wholes differ: along a stripe peaks are fitted together, so that
-    their errors are alike and their number tells nothing (cluster-robust: Liang and Zeger 1986, Biometrika 73, 13).
-    None where fewer than three stripes tell."""
+    their errors are alike and their number tells nothing. Lines are fitted without one stripe at a time (cluster
+    jackknife, Tukey 1958; CR3 of Bell and McCaffrey 2002). None where fewer than three stripes tell."""
 
     def __init__(self, index: Array, off: Array) -> None:
         """index, off: (M,) stripe and distance from the line of every peak."""
@@ -223,14 +226,20 @@ class _Spreads:
         if self._freedom < 1:
             return
         design = np.column_stack((index, np.ones_like(index)))
-        inverse = np.linalg.inv(design.T @ design)
-        scores = np.column_stack([np.bincount(self._at, design[:, k] * off) for k in (0, 1)])
-        self._covariance = inverse @ (scores.T @ scores) @ inverse * len(self._stripes) / self._freedom
+        by_stripe = [design[self._at == k] for k in range(len(self._stripes))]
+        right = np.stack([rows.T @ off[self._at == k] for k, rows in enumerate(by_stripe)])
+        normal = np.stack([rows.T @ rows for rows in by_stripe])
+        without = np.stack(
+            [np.linalg.solve(normal.sum(axis=0) - n, right.sum(axis=0) - r) for n, r in zip(normal, right, strict=True)]
+        )
+        apart = without - without.mean(axis=0)
+        self._covariance = apart.T @ apart * (len(self._stripes) - 1) / len(self._stripes)
         self._factor = float(student.ppf((1 + COVERAGE) / 2, self._freedom))
 
     def row(self, stripe: float) -> float | None:
-        """Of the line's row at a stripe."""
-        return self._along(np.array([stripe, 1.0]))
+        """Of the line's row at a stripe that was chosen of two because it is off most (Bonferroni)."""
+        spread = self._along(np.array([stripe, 1.0]))
+        return None if spread is None else spread * float(student.ppf((3 + COVERAGE) / 4, self._freedom)) / self._factor
 
     def line(self) -> dict[str, float | None]:
         """Of slope and intercept."""

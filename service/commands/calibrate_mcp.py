@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +15,8 @@ from service.terminal import print_error, print_facts, print_json
 
 if TYPE_CHECKING:
     from scanner.calibration.mcp_phase import McpPhase
-    from scanner.patterns import McpPattern
+    from scanner.geometry import Calibration
+    from scanner.patterns import McpPattern, ProjectorSize
 
 _PHASES = ("pmp", "gray+pmp")
 """Methods whose rows are phases at every pixel: finer than what they are to check."""
@@ -57,23 +59,41 @@ def mcp(
 
     if output is not None:
         try_file(output)
-    rows, peaks, pattern, pitch = _both(pmp, single)
-    axis = pattern.axis
+    rows, peaks, pattern, size = _both(pmp, single)
+    axis, pitch = pattern.axis, pattern.pitch_px(size)
     fit = mcp_phase(rows, peaks, pitch, pattern.stripe_count, axis=axis)
-    if calibration is not None and output is not None:
-        content = {**load_calibration(calibration).as_dict(), "mcp_phase": fit.member}
+    written = None if fit.good is False else output
+    if calibration is not None:
+        known = load_calibration(calibration)
+        _require_rig(known, calibration, rows.shape, size)
+        content = {**known.as_dict(), "mcp_phase": fit.member}
         content["id"] = content_id(content)
-        replace_file(output, as_text(content).encode())
+        if written is not None:
+            replace_file(written, as_text(content).encode())
     ideal = {"slope": pitch, "intercept": pitch / 2 - 0.5}
     if as_json:
         verdict = {"good": fit.good, "open_questions": fit.open_questions, "axis": axis, "coverage_factor": 2.0}
-        print_json({**vars(fit), "ideal": ideal, "file": output and str(output), **verdict})
+        print_json({**vars(fit), "ideal": ideal, "file": written and str(written), **verdict})
     else:
         facts = _facts(fit, pitch, "row" if axis == "y" else "column")
-        print_facts("code to phase", facts if output is None else [*facts, ("file", output)])
+        print_facts("code to phase", facts if written is None else [*facts, ("file", written)])
     for words, hint in _troubles(fit, "rows" if axis == "y" else "columns"):
         print_error(words, hint, label="warning")
+    if written is None and output is not None:
+        print_error(f"{output} is not written: the fit is not good")
+        return 1
     return 0
+
+
+def _require_rig(known: Calibration, path: Path, picture: tuple[int, ...], projector: ProjectorSize) -> None:
+    """Raise CalibrationError where a calibration is of another rig than the scans."""
+    from scanner.errors import CalibrationError  # noqa: PLC0415
+
+    there = (*known.camera.size, *known.projector.size)
+    here = (picture[1], picture[0], projector.width, projector.height)
+    if there != here:
+        words = ["camera {} x {}, projector {} x {}".format(*sizes) for sizes in (there, here)]
+        raise CalibrationError(f"{path} is another rig's: {words[0]}, and the scans have {words[1]}")
 
 
 def _facts(fit: McpPhase, pitch: float, line: str) -> list[tuple[str, Any]]:
@@ -147,8 +167,8 @@ def _troubles(fit: McpPhase, lines: str) -> list[tuple[str, str]]:
     return found
 
 
-def _both(pmp: Path, single: Path) -> tuple[Any, Any, McpPattern, float]:
-    """PMP's map along MCP's axis, MCP's peaks, its pattern and pitch."""
+def _both(pmp: Path, single: Path) -> tuple[Any, Any, McpPattern, ProjectorSize]:
+    """PMP's map along MCP's axis, MCP's peaks, its pattern, and the projector's size."""
     from scanner.capture import Capture  # noqa: PLC0415
     from scanner.errors import DecodeError  # noqa: PLC0415
     from scanner.patterns import McpPattern  # noqa: PLC0415
@@ -157,7 +177,8 @@ def _both(pmp: Path, single: Path) -> tuple[Any, Any, McpPattern, float]:
     dense, stripes = load_scan(pmp), load_scan(single)
     if stripes.peaks is None:
         raise DecodeError(f"{single} is no MCP scan", hint=_ORDER)
-    if (dense.report.get("decoder") or {}).get("method") not in _PHASES:
+    decoder = dense.report.get("decoder")
+    if not isinstance(decoder, Mapping) or decoder.get("method") not in _PHASES:
         raise DecodeError(f"{pmp} is no PMP scan", hint=_ORDER)
     sequence = Capture.open(single / "capture").header.sequence
     if not isinstance(sequence.pattern, McpPattern):
@@ -170,4 +191,4 @@ def _both(pmp: Path, single: Path) -> tuple[Any, Any, McpPattern, float]:
         )
     if rows.shape != stripes.shape:
         raise DecodeError(f"{pmp} and {single} have pictures of different sizes")
-    return rows, stripes.peaks, sequence.pattern, sequence.pattern.pitch_px(sequence.projector)
+    return rows, stripes.peaks, sequence.pattern, sequence.projector

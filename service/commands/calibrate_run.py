@@ -155,6 +155,7 @@ def _guided(
         session = GuidedCalibration(client, target, asked.folder, options)
         try:
             if taken_up := session.take_up():
+                session.require_this_rig()
                 say(f"{taken_up} poses of {asked.folder} are taken up")
                 if simulated:
                     say(f"a simulated target begins in its first pose again: &pose={taken_up} in its name goes on")
@@ -235,6 +236,7 @@ class _Loop:
         self._said_after_s = SAID_EVERY_S
         self._told = False
         self._advice = ""
+        self._not_kept = ""
         self._levels = levels
         self.response: dict[str, Any] | None = None if levels is None else levels.response
         """the projector's, where scans should undo it"""
@@ -296,6 +298,7 @@ class _Loop:
         good, words = self._session.capture(_frames)
         number = len(self._session.observations)
         say(f"pose {number}: {words}" if good else f"not kept: {words}")
+        self._not_kept = "" if good else words
         if self._still is not None:
             self._still.forget()
         if good:
@@ -313,6 +316,9 @@ class _Loop:
     def _undo(self) -> None:
         name = self._session.undo()
         say("there is no pose to take back" if name is None else f"pose {name} is taken back")
+        if not self._session.observations and self._told:
+            # What fringes told was that pose's: the next one tells it.
+            self._told, self.response = False, None if self._levels is None else self._levels.response
 
     def _say_next(self) -> None:
         guide = self._session.guide
@@ -323,7 +329,10 @@ class _Loop:
 
     def last_line(self) -> str:
         """What keeps the pose that is seen now from being captured."""
-        seen = "the target stands as before" if self._session.observations else "the target is seen: Enter captures"
+        waits = "it is captured when it stands still" if self._auto else "Enter captures"
+        seen = "the target stands as before" if self._session.observations else f"the target is seen: {waits}"
+        if self._not_kept:
+            return f"the last capture was not kept: {self._not_kept}"
         return self._seen if isinstance(self._seen, str) else self._seen.trouble or seen
 
     def _draw(self, pixels: Any, line: str) -> None:

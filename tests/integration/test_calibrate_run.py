@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from drivers.simulated.rigs import rig as reference_rig
 from scanner.calibration.solve import SolveOptions
 from scanner.calibration.targets import parse_target
 from scanner.capture import Capture
+from scanner.errors import CalibrationError
 from scanner.geometry import load_calibration
 from service.cli import main
 from service.config import load_rig
@@ -81,7 +83,34 @@ def test_a_rig_is_calibrated_by_itself(rig: Path, tmp_path: Path, capsys: pytest
     assert again.solved().state.camera.matrix[0, 0] == pytest.approx(found.camera.matrix[0, 0])
     assert again.undo() == f"{POSES:02d}"
     assert len(again.captures) == POSES - 1
+    (folder / "poses" / f"{POSES + 4:02d}").touch()  # of whatever kind: the next pose stands behind it
+    assert again._free_place().name == f"{POSES + 5:02d}"
     again.close()
+
+
+class _Elsewhere:
+    """A daemon whose devices have other sizes."""
+
+    def preview_start(self, **_: object) -> str:
+        return ""
+
+    def preview_stop(self) -> None:
+        """Nothing."""
+
+    def status(self) -> dict[str, object]:
+        return {"devices": {side: {"width": 1392, "height": 1040} for side in ("camera", "projector")}}
+
+
+def test_poses_of_another_rig_are_not_taken_up(tmp_path: Path) -> None:
+    session = GuidedCalibration(_Elsewhere(), parse_target(TARGET), tmp_path, SolveOptions())  # type: ignore[arg-type]
+    session.require_this_rig()  # none are there
+    size = (320, 240)
+    session.observations.append(SimpleNamespace(view=SimpleNamespace(name="01"), camera_size=size, projector_size=size))  # type: ignore[arg-type]
+    with pytest.raises(
+        CalibrationError, match=r"pose 01 of .* is another rig's: camera 320 x 240, projector 320 x 240"
+    ):
+        session.require_this_rig()
+    session.close()
 
 
 @pytest.mark.usefixtures("quick")

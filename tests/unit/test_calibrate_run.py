@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -230,6 +231,37 @@ def test_what_grey_levels_told_stays_and_the_first_pose_checks_it(
     said = capsys.readouterr().err
     assert "to the power of 1.600 +- 0.036 (k = 2); the file has what grey levels told" in said
     assert "fringes contradict grey levels: they should have told 2.200, and 0.600 is more" in said
+
+
+def test_a_pose_that_is_taken_back_takes_its_response_with_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Told(Session):
+        exponents: Sequence[float] = (1.6, 1.9, 1.6)
+
+        def response(self) -> Response:
+            exponent, *Told.exponents = Told.exponents
+            return Response(exponent, 0.002, exponent, 0.4, 0.1, 0.01, 900)
+
+    asked = calibrate_run._Asked(tmp_path, tmp_path / "live.png", 3, False)
+    looped = calibrate_run._Loop(Told(sight_at(0)), asked, Pressed(" \nu\nq"), None)  # type: ignore[arg-type]
+    looped.run()
+    assert looped.response == {"gamma": 1.9, "table": None}
+    looped = calibrate_run._Loop(Told(sight_at(0)), asked, Pressed(" \nuq"), None)  # type: ignore[arg-type]
+    looped.run()
+    assert looped.response is None
+
+
+def test_why_a_capture_was_not_kept_is_the_last_word(tmp_path: Path) -> None:
+    class Refusing(Session):
+        def capture(self, on_event: Any) -> tuple[bool, str]:
+            return False, "out of step"
+
+    asked = calibrate_run._Asked(tmp_path, tmp_path / "live.png", 3, False)
+    looped = calibrate_run._Loop(Refusing(sight_at(0)), asked, Pressed(" \nq"))  # type: ignore[arg-type]
+    assert looped.last_line() == "no picture of the camera yet"
+    looped.run()
+    assert looped.last_line() == "the last capture was not kept: out of step"
 
 
 @pytest.mark.parametrize(

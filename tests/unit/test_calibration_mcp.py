@@ -64,6 +64,7 @@ def test_the_line_is_as_sure_as_stripes_differ() -> None:
     """Stripes that are off as wholes, as when the code's edges are: their peaks' number makes nothing surer."""
     rows, plain = stripes(27.0, 13.0)
     within: list[bool] = []
+    worst: list[bool] = []
     for seed in range(40):
         peaks = plain[plain[:, 3] == np.round(plain[:, 3])].copy()
         off = np.random.default_rng(seed).normal(0, 0.1, 32)
@@ -71,7 +72,10 @@ def test_the_line_is_as_sure_as_stripes_differ() -> None:
         found = mcp_phase(rows, peaks, 27.0, 32)
         assert found.expanded["slope"] is not None
         within.append(abs(found.slope - 27.0) < found.expanded["slope"])
+        assert found.expanded["deviation_px"] is not None
+        worst.append(found.deviation_px < found.expanded["deviation_px"])
     assert 34 <= sum(within) <= 40, "95 % are expected"
+    assert 34 <= sum(worst) <= 40, "95 % of what is the larger one of two"
     two = plain[np.isin(plain[:, 3], (10, 11))]
     assert set(mcp_phase(rows, np.repeat(two, 5, axis=0), 27.0, 32).expanded.values()) == {None}
 
@@ -115,6 +119,9 @@ def test_scans_of_two_scenes_are_refused() -> None:
 
 def test_too_few_peaks_are_refused() -> None:
     rows, peaks = stripes(27.0, 13.0)
+    for none in (peaks[:0], np.full_like(peaks, np.nan)):
+        with pytest.raises(DecodeError, match="0 stripe peaks lie on pixels"):
+            mcp_phase(rows, none, 27.0, 32)
     with pytest.raises(DecodeError, match="stripe peaks lie on pixels"):
         mcp_phase(np.full_like(rows, np.nan), peaks, 27.0, 32)
 
@@ -129,7 +136,8 @@ def test_mcp_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     (single / "capture" / "capture.json").write_text(json.dumps(header.as_dict()))
     lens = {"size": [300, 400], "matrix": [[500, 0, 150], [0, 500, 200], [0, 0, 1]], "distortion": [0.0] * 5}
     old, new = tmp_path / "rig.json", tmp_path / "new.json"
-    content = {"format": "fringed-calibration", "version": 1, "camera": lens, "projector": lens}
+    lamp = {"size": [1152, 864], "matrix": [[2000, 0, 576], [0, 2000, 432], [0, 0, 1]], "distortion": [0.0] * 5}
+    content = {"format": "fringed-calibration", "version": 1, "camera": lens, "projector": lamp}
     old.write_text(json.dumps({**content, "rotation": np.eye(3).tolist(), "translation": [0, 100, 0]}))
     words = ["calibrate", "mcp", dense, str(single)]
     assert main([*words, "--calibration", str(old), "-o", str(new), "--json"]) == 0
@@ -152,6 +160,13 @@ def test_mcp_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     off = str(save(tmp_path / "off", None, method="pmp", rows=rows + np.float32(0.4)))
     assert main(["calibrate", "mcp", off, str(single)]) == 0
     assert "stripes and PMP rows differ by up to 0.40 rows" in capsys.readouterr().err
+    bad, other = tmp_path / "bad.json", tmp_path / "other.json"
+    assert main(["calibrate", "mcp", off, str(single), "--calibration", str(old), "-o", str(bad)]) == 1
+    assert "is not written: the fit is not good" in capsys.readouterr().err
+    other.write_text(json.dumps({**json.loads(old.read_text()), "projector": lens}))
+    assert main([*words, "--calibration", str(other), "-o", str(bad)]) == 1
+    assert "is another rig's: camera 300 x 400, projector 300 x 400, and the scans have" in capsys.readouterr().err
+    assert not bad.exists()
     assert main(["calibrate", "mcp", dense, dense]) == 1
     assert "is no MCP scan" in capsys.readouterr().err
     assert main(["calibrate", "mcp", str(single), str(single)]) == 1
