@@ -31,8 +31,13 @@ BAD_VIEW_PX = 0.15
 DOUBTED = 2.5
 """A view that the others miss by so many times what is typically left has all of them asked who agrees with whom: of
 sound ones alike, the worst is missed by 1.2 to 2 times that."""
+SMOOTH_TIMES, SMOOTH_PX = 5.0, 0.05
+"""Where so many times what is rough of it, and so much, px, is left, all views are asked, too: corners are as good as
+what they do not share with their neighbours. A rig that views bend leaves smooth remainders, and so do bent prints."""
 DISC_ROUNDS = 3
 """Of adjustment and the discs' eccentricity in turn."""
+SPLIT = 6.0
+"""By how many times less must be left of half of the views: fewer fit a rig better than all do, by half perhaps."""
 DRAWS = 24
 """Triples of views that are tried: with three bad ones in eight, a triple of good ones is missed once in a hundred."""
 HOPELESS_SHARE = 0.01
@@ -43,18 +48,31 @@ GROWN = 3
 
 @dataclass(frozen=True, eq=False)
 class Agreed:
-    """problem: with the views that agree; adjusted: theirs; left_out: the others; held_out: None if not asked."""
+    """problem: with the views that agree; adjusted: theirs; left_out: the others; held_out: None if not asked. split: a
+    group that agrees far better than all of them do, and is no majority: nobody can say who is right."""
 
     problem: Problem
     adjusted: Adjusted
     left_out: tuple[LeftOut, ...] = ()
     held_out: HeldOut | None = None
+    split: Agreed | None = None
 
     @property
     def doubtful(self) -> bool:
         """Whether some views may bend the rig."""
         held = self.held_out
-        return self.worst_px > BAD_VIEW_PX or (held is not None and held.most_px > DOUBTED * held.typical_px)
+        missed = held is not None and held.most_px > DOUBTED * held.typical_px
+        return self.worst_px > BAD_VIEW_PX or missed or self.left_px > max(SMOOTH_TIMES * self.rough_px, SMOOTH_PX)
+
+    @property
+    def rough_px(self) -> float:
+        """Of `left_px` what is no smooth function of a view's points (quadratic), px: the median of the views."""
+        found = [
+            _rough(self.problem.target.points[view.ids[kept]], residuals[k][kept])
+            for residuals in (self.adjusted.camera_residuals, self.adjusted.projector_residuals)
+            for k, (view, kept) in enumerate(zip(self.problem.views, self.adjusted.kept, strict=True))
+        ]
+        return float(np.nanmedian(found)) if np.isfinite(found).any() else float("inf")
 
     @property
     def left_px(self) -> float:
@@ -119,18 +137,44 @@ def _searched(problem: Problem, whole: Agreed | None, *, leave_out: bool) -> Agr
         return None
     every = whole if whole is not None and not whole.left_out else _fitted(problem)
     every = _held_out(every) if every is not None and leave_out else every
-    ranked = sorted(((_score(problem, triple), triple) for triple in _triples(count)), key=lambda trial: trial[0])
+    tried = [(_missed_by(problem, triple), triple) for triple in _triples(count)]
+    # Least median of squares (Rousseeuw 1984): what a majority of the views misses the triple's rig by, at most.
+    ranked = sorted(((_of_majority(missed), triple) for missed, triple in tried), key=lambda trial: trial[0])
     grown = [_grown(problem, triple) for score, triple in ranked[:GROWN] if np.isfinite(score)]
     groups = {tuple(used): fit for used, fit in grown if fit is not None and count // 2 < len(used) < count}
     found = [(used, _held_out(fit) if leave_out else fit) for used, fit in groups.items()]
     found = [group for group in found if every is None or _clearer(group[1], every)]
     if not found:
-        return None
+        return None if every is None else _split(problem, every, [missed for missed, _ in tried])
     # A large group that a bad view bends is no better than the small one that it was grown from.
     least = min(fit.left_px for _, fit in found)
     clean = [group for group in found if group[1].worst_px <= max(BAD_VIEW * least, BAD_VIEW_PX)]
     used, best = max(clean or found, key=lambda group: (len(group[0]), -group[1].left_px))
     return replace(best, left_out=tuple(_contradicting(problem, best, k) for k in range(count) if k not in used))
+
+
+def _split(problem: Problem, every: Agreed, tried: Sequence[Array]) -> Agreed | None:
+    """Every view, with the half of them that agrees far better; None where none does. tried: (V,) px by which views
+    miss rigs of three."""
+    half = len(problem.views) // 2
+    if half < FEWEST_VIEWS:
+        return None
+    missed = min(tried, key=lambda one: float(np.sort(one)[half - 1]))
+    fit = _fitted(_of(problem, sorted(int(k) for k in np.argsort(missed)[:half])))
+    if fit is None or SPLIT * fit.left_px > every.left_px:
+        return None
+    return replace(every, split=fit)
+
+
+def _rough(points: Array, residuals: Array) -> float:
+    """Rms distance, px, of residuals (n, 2) from a quadratic function of their points (n, 3); NaN of few."""
+    x, y = ((points[:, :2] - points[:, :2].mean(axis=0)) / max(float(np.ptp(points[:, :2])), 1e-9)).T
+    terms = np.column_stack((np.ones_like(x), x, y, x * x, x * y, y * y))
+    free = len(points) - terms.shape[1]
+    if free < terms.shape[1]:
+        return float("nan")
+    left = residuals - terms @ np.linalg.lstsq(terms, residuals, rcond=None)[0]
+    return float(np.sqrt((left**2).sum() / free))
 
 
 def _clearer(group: Agreed, every: Agreed) -> bool:
@@ -160,12 +204,10 @@ def _triples(count: int) -> list[tuple[int, ...]]:
     return [every[k] for k in drawn]
 
 
-def _score(problem: Problem, triple: Sequence[int]) -> float:
-    """px that a majority of the views miss the triple's rig by, at most: least median of squares (Rousseeuw 1984)."""
+def _missed_by(problem: Problem, triple: Sequence[int]) -> Array:
+    """(V,) px by which views miss the triple's rig; infinite where there is none."""
     fit = _fitted(_of(problem, triple), rounds=2)
-    if fit is None:
-        return float("inf")
-    return _of_majority(_misses(problem, fit))
+    return np.full(len(problem.views), np.inf) if fit is None else _misses(problem, fit)
 
 
 def _of_majority(misses: Array) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.calibration.adjustment import Adjusted
-from scanner.calibration.agreement import BAD_VIEW, agreed
+from scanner.calibration.agreement import BAD_VIEW, Agreed, agreed
 from scanner.calibration.coverage import not_met
 from scanner.calibration.drift import epipolar_offsets
 from scanner.calibration.held_out import HeldOut
@@ -145,6 +145,8 @@ def solve(
     out += found.left_out
     check_state(problem, adjusted)
     warnings = check_stated(problem, adjusted.state, options.baseline_mm, options.distance_mm)
+    if found.split is not None:
+        warnings.append(_split_words(found, found.split))
     held_out = found.held_out or HeldOut.nothing(adjusted)
     adjusted = replace(adjusted, covariance=held_out.covariance)
     used = {view.name for view in problem.views}
@@ -165,6 +167,15 @@ def solve(
         warm_up_of(served),
     )
     return replace(solution, warnings=tuple(warnings + _warnings(solution) + warnings_of(served)))
+
+
+def _split_words(every: Agreed, group: Agreed) -> str:
+    names = ", ".join(view.name for view in group.problem.views)
+    return (
+        f"views contradict each other, and no majority says which are right: {group.left_px:.3f} px are left of "
+        f"{names} alone, {every.left_px:.3f} px of all {len(every.problem.views)}. Was camera, projector or lens moved "
+        "between them? Calibrate with those of one time"
+    )
 
 
 def epipolar_errors(problem: Problem, state: State) -> tuple[Array, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -96,6 +97,25 @@ def test_a_view_of_which_a_part_is_noisy_contradicts_nobody(monkeypatch: pytest.
     assert not any("contradict each other" in warning for warning in found.warnings)
     assert np.nanargmax(found.held_out.errors) == 3
     assert sigmas_off(found) < 3
+
+
+def knocked(count: int, late: int, off: float) -> list[Observation]:
+    """Sharp views, the last of them after the camera's picture was shifted, px: a knock, or a lens touched."""
+    every = observations(RIG, poses(count, seed=3), target=SMALL, seed=3, noise=(0.003, 0.005))
+    for k in range(count - late, count):
+        view = every[k].view
+        every[k] = replace(every[k], view=replace(view, camera=view.camera + np.array([0.0, off])))
+    return every
+
+
+def test_a_rig_that_was_knocked_between_views_is_told() -> None:
+    """What is left is then a tenth of a pixel in every view, which is little, and all of it smooth, which is odd."""
+    after = solve(SMALL, knocked(8, 3, 1.0), LENGTH)
+    assert {one.name for one in after.left_out} == {"pose05", "pose06", "pose07"}
+    half = solve(SMALL, knocked(8, 4, 2.0), LENGTH)
+    (said,) = (words for words in half.warnings if "no majority says which are right" in words)
+    assert re.search(r"of pose0[04], pose0[15], pose0[26], pose0[37] alone", said)
+    assert not any("no majority" in words for words in solve(SMALL, knocked(8, 0, 0.0), LENGTH).warnings)
 
 
 def test_without_a_majority_the_refusal_says_so() -> None:
