@@ -6,9 +6,12 @@ that was interrupted goes on, and `fringed calibrate solve` takes what there is.
 
 from __future__ import annotations
 
+import fcntl
+import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,7 @@ import zmq
 from numpy.typing import NDArray
 
 from scanner.calibration.calibration_file import rms
+from scanner.calibration.copies import again
 from scanner.calibration.guide import Guide, Seen
 from scanner.calibration.observe import LeftOut, Observation, find_captures, observe_capture
 from scanner.calibration.response import Response, response_of_frames
@@ -64,6 +68,27 @@ def require_own(folder: Path, *names: str) -> None:
         )
 
 
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Nobody else runs a calibration in a folder, which is there, while the block runs.
+
+    Raises:
+        StorageError: somebody does.
+    """
+    with storage_errors(folder):
+        held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise StorageError(
+                f"another calibration runs in {folder}", hint="wait for it, or give another -o"
+            ) from error
+        yield
+    finally:
+        os.close(held)
+
+
 class GuidedCalibration:
     """One run. Poses that are in the folder already are taken up."""
 
@@ -97,10 +122,16 @@ class GuidedCalibration:
         return find_captures([poses]) if poses.is_dir() and any(poses.iterdir()) else []
 
     def take_up(self) -> int:
-        """Look at the poses that the folder holds; how many serve."""
-        poses = self._folder / POSES
+        """Look at the poses that the folder holds; how many serve. Copies of one do not."""
+        poses, seen = self._folder / POSES, dict[Hashable, tuple[Path, str]]()
         for path in self.captures:
-            self._keep(observe_capture(path, path.relative_to(poses).as_posix(), self.target))
+            name = path.relative_to(poses).as_posix()
+            outcome = observe_capture(path, name, self.target)
+            if isinstance(outcome, Observation):
+                how = again(path, (outcome.key,), seen)
+                seen.setdefault(outcome.key, (path, name))
+                outcome = outcome if how is None else LeftOut(name, f"it {how}, and tells nothing new")
+            self._keep(outcome)
         return len(self.observations)
 
     def require_this_rig(self) -> None:

@@ -27,7 +27,7 @@ from service.commands.calibrate_solve import (
     length_given,
     report,
 )
-from service.commands.options import AsJson, Connect, output_path
+from service.commands.options import AsJson, Connect, output_path, require_picture
 from service.terminal import progress_lines
 
 if TYPE_CHECKING:
@@ -99,10 +99,12 @@ def run(
     from scanner.errors import ConfigError  # noqa: PLC0415
     from scanner.storage import storage_errors, try_file  # noqa: PLC0415
     from service.config import is_simulated  # noqa: PLC0415
-    from service.guided_calibration import require_own  # noqa: PLC0415
+    from service.guided_calibration import alone_in, require_own  # noqa: PLC0415
 
     if (rig is None) == (connect is None):
         raise typer.BadParameter("give RIG, or --connect to a running daemon, which has a rig of its own")
+    if picture is not None:
+        require_picture(picture)
     if write and (rig is None or is_simulated(rig)):
         raise ConfigError("there is no rig file to write to", hint="leave --write out")
     options = SolveOptions(None if length is None else length_given(length), rigid, baseline, distance, warm_up)
@@ -121,10 +123,10 @@ def run(
         folder.mkdir(parents=True, exist_ok=True)
     for path in (result, picture or folder / LIVE_PICTURE, *((Path(rig),) if write and rig is not None else ())):
         try_file(path)
-    solution, response = _guided(
-        rig, connect, looked_for, options, _Asked(folder, picture or folder / LIVE_PICTURE, poses, auto)
-    )
-    content, drawing = _written(solution, response, result, folder / RESULT_PICTURE)
+    asked = _Asked(folder, picture or folder / LIVE_PICTURE, poses, auto)
+    with alone_in(folder):
+        solution, response = _guided(rig, connect, looked_for, options, asked)
+        content, drawing = _written(solution, response, result, folder / RESULT_PICTURE)
     report(solution, content, result, drawing, as_json=as_json, response=response)
     _named_in_rig(rig, result, write=write)
     return 0
@@ -164,12 +166,12 @@ def _guided(
                 loop.run()
             if not session.observations and not session.left_out:
                 raise CalibrationError("no pose was captured", hint=f"at the end: {loop.last_line()}")
-            with progress_lines() as lines:
-                try:
+            try:
+                with progress_lines() as lines:
                     return session.solved(leave_out=True, progress=lines.stage), loop.response
-                except ScannerError:  # else its warnings say so
-                    _say_lacking(session.guide, simulated=simulated)
-                    raise
+            except ScannerError:  # else its warnings say so
+                _say_lacking(session.guide, simulated=simulated)
+                raise
         except (KeyboardInterrupt, SystemExit, ScannerError):
             if session.observations:
                 say(f"the poses are kept: the same command with -o {asked.folder} goes on with them")

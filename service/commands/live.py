@@ -33,6 +33,7 @@ from service.commands.options import (
     Unmodulated,
     filter_members,
     output_path,
+    require_picture,
 )
 from service.commands.scan import exposure_given, rig_daemon
 from service.terminal import print_error, print_facts, print_json, progress_lines, status_line
@@ -112,9 +113,8 @@ def live(
         raise typer.BadParameter("--last says what --record keeps: give both")
     if stride > 1 and not xyz:
         raise typer.BadParameter("--stride thins points: give --xyz too")
-    if picture is not None and picture.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise typer.BadParameter(f"--picture: expected a png or jpg file, got {str(picture)!r}")
     if picture is not None:
+        require_picture(picture)
         from scanner.storage import try_file  # noqa: PLC0415
 
         try_file(picture)

@@ -24,6 +24,12 @@ def output_path(text: str) -> Path:
     return Path(text)
 
 
+def require_picture(path: Path) -> None:
+    """Raise typer.BadParameter where `--picture` names a kind of file that live pictures are not written as."""
+    if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise typer.BadParameter(f"--picture: expected a png or jpg file, got {str(path)!r}")
+
+
 def require_free(*files: Path | None, force: bool) -> None:
     """Refuse files to write (None: none) that are folders, or that are there and not to be replaced.
 

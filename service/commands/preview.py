@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands.options import AsJson, Connect
+from service.commands.options import AsJson, Connect, require_picture
 from service.commands.scan import rig_daemon
 from service.terminal import print_facts, print_json, progress_lines, status_line
 
@@ -65,8 +65,7 @@ def preview(
     """
     if rig is not None and connect is not None:
         raise typer.BadParameter("--rig and --connect exclude each other: a running daemon has a rig of its own")
-    if picture.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise typer.BadParameter(f"--picture: expected a png or jpg file, got {str(picture)!r}")
+    require_picture(picture)
     from scanner.client import Client  # noqa: PLC0415
     from scanner.storage import try_file  # noqa: PLC0415
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,11 +13,11 @@ from drivers.simulated.rigs import rig as reference_rig
 from scanner.calibration.solve import SolveOptions
 from scanner.calibration.targets import parse_target
 from scanner.capture import Capture
-from scanner.errors import CalibrationError
+from scanner.errors import CalibrationError, StorageError
 from scanner.geometry import load_calibration
 from service.cli import main
 from service.config import load_rig
-from service.guided_calibration import GuidedCalibration
+from service.guided_calibration import GuidedCalibration, alone_in
 
 TARGET = "chessboard:9x6:19"
 POSES = 3
@@ -83,9 +84,22 @@ def test_a_rig_is_calibrated_by_itself(rig: Path, tmp_path: Path, capsys: pytest
     assert again.solved().state.camera.matrix[0, 0] == pytest.approx(found.camera.matrix[0, 0])
     assert again.undo() == f"{POSES:02d}"
     assert len(again.captures) == POSES - 1
+    shutil.copytree(folder / "poses" / "01", folder / "poses" / "20")
+    copied = GuidedCalibration(None, parse_target(TARGET), folder, SolveOptions())  # type: ignore[arg-type]
+    assert copied.take_up() == POSES - 1
+    assert [one.reason for one in copied.left_out] == ["it is a copy of 01, and tells nothing new"]
+    copied.close()
+    shutil.rmtree(folder / "poses" / "20")
     (folder / "poses" / f"{POSES + 4:02d}").touch()  # of whatever kind: the next pose stands behind it
     assert again._free_place().name == f"{POSES + 5:02d}"
     again.close()
+
+
+def test_two_runs_in_one_folder_do_not_mix_their_poses(tmp_path: Path) -> None:
+    with alone_in(tmp_path), pytest.raises(StorageError, match="another calibration runs in"), alone_in(tmp_path):
+        pass
+    with alone_in(tmp_path):
+        pass
 
 
 class _Elsewhere:

@@ -123,6 +123,13 @@ def test_a_folder_in_a_files_place_is_not_to_be_replaced(
     assert "replaces" not in err
 
 
+def test_a_live_picture_of_another_kind_is_refused_before_anything_begins(run: Run) -> None:
+    for words in (("calibrate", "run", "simulated", "--target", "chessboard:9x6:20"), ("preview",), ("live",)):
+        status, _, err = run(*words, "--picture", "x.tiff")
+        assert status == 2
+        assert "--picture: expected a png or jpg file, got 'x.tiff'" in err
+
+
 def test_no_daemon_says_how_to_start_one(run: Run, tmp_path: Path) -> None:
     status, out, err = run("status", "--connect", f"ipc://{tmp_path}/none.ipc")
     assert (status, out) == (1, "")
