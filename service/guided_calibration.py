@@ -11,7 +11,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from scanner.calibration.targets import Target
 from scanner.capture import Capture
 from scanner.client import Client
 from scanner.client_sockets import conflated
-from scanner.errors import CalibrationError, DecodeError, StorageError, SyncError, Unreachable
+from scanner.errors import CalibrationError, DecodeError, ScannerError, StorageError, SyncError, Unreachable
 from scanner.session import raise_unless_done
 from scanner.storage import storage_errors
 from scanner.wire import Event
@@ -111,7 +111,8 @@ class GuidedCalibration:
         self._context.destroy(linger=0)
         if self._preview is not None:
             self._preview = None
-            self._client.preview_stop()
+            with suppress(ScannerError):  # a daemon that is gone shows none, and that it is gone was said
+                self._client.preview_stop()
 
     # --- poses -----------------------------------------------------------------------------------------------------
 
@@ -138,6 +139,7 @@ class GuidedCalibration:
         """Raise CalibrationError where poses are of a rig with other devices than are here."""
         self._client.preview_start(rate_hz=PREVIEW_HZ, max_width=PREVIEW_WIDTH)  # opens the devices
         devices = self._client.status()["devices"]
+        self._client.preview_stop()
         if devices is None:
             return
         here = tuple((devices[side]["width"], devices[side]["height"]) for side in ("camera", "projector"))

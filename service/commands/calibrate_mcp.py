@@ -180,6 +180,11 @@ def _both(pmp: Path, single: Path) -> tuple[Any, Any, McpPattern, ProjectorSize]
     decoder = dense.report.get("decoder")
     if not isinstance(decoder, Mapping) or decoder.get("method") not in _PHASES:
         raise DecodeError(f"{pmp} is no PMP scan", hint=_ORDER)
+    if not (single / "capture").is_dir():
+        raise DecodeError(
+            f"{single} has no capture, which says what was projected",
+            hint="give the folder that fringed scan wrote; one that was decoded again is without",
+        )
     sequence = Capture.open(single / "capture").header.sequence
     if not isinstance(sequence.pattern, McpPattern):
         raise DecodeError(f"{single} is no MCP scan", hint=_ORDER)

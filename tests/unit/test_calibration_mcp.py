@@ -169,5 +169,8 @@ def test_mcp_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert not bad.exists()
     assert main(["calibrate", "mcp", dense, dense]) == 1
     assert "is no MCP scan" in capsys.readouterr().err
+    again = save(tmp_path / "again", None, method="mcp", rows=rows, peaks=peaks)
+    assert main(["calibrate", "mcp", dense, str(again)]) == 1
+    assert "has no capture, which says what was projected" in capsys.readouterr().err
     assert main(["calibrate", "mcp", str(single), str(single)]) == 1
     assert "is no PMP scan" in capsys.readouterr().err
