@@ -5,7 +5,7 @@ exact Jacobian (dense: SciPy's way with sparse ones stops a hundred sigmas short
 projector pixel is read at the camera pixel where the point was found, so an error of the camera's
 point moves both: the projector's residual is taken after that common part (`View.slope`), which makes the two
 independent and the relation of both lenses as sharp as the phase is. What the pictures leave open (aspect, high terms
-of distortion, the sheet's stretch and bow) rests on priors that say how far such things go in practice. The sigmas of
+of distortion, the sheet's stretch and bend) rests on priors that say how far such things go in practice. The sigmas of
 both kinds of pixels come from the residuals themselves (variance components, Helmert 1907), and so does the covariance.
 """
 
@@ -57,7 +57,7 @@ class Adjusted:
     """The outcome.
 
     camera_residuals, projector_residuals: per view (N, 2) px, seen minus predicted, the projector's plain ones;
-    kept: per view (N,) points that took part in the last round; covariance: (27, 27) of the parameters that are no
+    kept: per view (N,) points that took part in the last round; covariance: (29, 29) of the parameters that are no
     pose, in the order of NAMES, zero for those held fixed; sigma_camera: px; projector_factor: on the views' sigmas.
     """
 
@@ -199,7 +199,7 @@ class Equations:
         return tuple(one if one.mean() > LEAST_KEPT else np.ones_like(one) for one in each)
 
     def covariance(self, x: Array) -> tuple[Array, float]:
-        """Of the parameters that are no pose, (27, 27), zero where fixed; and the weighted square per freedom."""
+        """Of the parameters that are no pose, (29, 29), zero where fixed; and the weighted square per freedom."""
         residuals, jacobian = self.evaluate(x)
         part = jacobian[:, self._free]
         whole = np.zeros((len(x), len(x)))
@@ -215,7 +215,7 @@ class Equations:
         return tuple(np.split(camera, cuts)), tuple(np.split(projector, cuts))
 
     def _points(self, x: Array) -> tuple[Array, Array]:
-        """Residuals (2, N, 2) px of camera and projector; their slopes (2, N, 2, 33): the rig's 27, the pose's 6."""
+        """Residuals (2, N, 2) px of camera and projector; their slopes (2, N, 2, 35): the rig's 29, the pose's 6."""
         sheet, by_sheet = sheet_points(self._problem.target, x[SHEET])
         poses = x[POSES:].reshape(-1, 6)
         turns = np.stack([rotation_of(pose[:3]) for pose in poses])
@@ -225,20 +225,20 @@ class Equations:
         turned = (rotation @ sheet[self._ids][..., None])[..., 0]
         in_camera = turned + poses[self._of, 3:]
         # Slopes of the point in the camera's frame: sheet, pose's turn, pose's shift.
-        by = np.empty((n, 3, 9))
-        by[:, :, :3] = rotation @ by_sheet[self._ids]
-        by[:, :, 3:6] = turned_slopes(lefts[self._of], turned)
-        by[:, :, 6:] = np.eye(3)
+        by = np.empty((n, 3, POSES + 6 - SHEET.start))
+        by[:, :, :-6] = rotation @ by_sheet[self._ids]
+        by[:, :, -6:-3] = turned_slopes(lefts[self._of], turned)
+        by[:, :, -3:] = np.eye(3)
         seen_camera, camera_lens, camera_point = seen(x[CAMERA], in_camera)
         in_turned = in_camera @ turn.T
         seen_projector, projector_lens, projector_point = seen(x[PROJECTOR], in_turned + x[SHIFT])
-        block = np.zeros((2, n, 2, 33))
+        block = np.zeros((2, n, 2, POSES + 6))
         block[0, :, :, CAMERA] = camera_lens
-        block[0, :, :, 24:] = camera_point @ by
+        block[0, :, :, SHEET.start :] = camera_point @ by
         block[1, :, :, PROJECTOR] = projector_lens
         block[1, :, :, TURN] = projector_point @ turned_slopes(left_jacobian(x[TURN]), in_turned)
         block[1, :, :, SHIFT] = projector_point
-        block[1, :, :, 24:] = projector_point @ (turn @ by)
+        block[1, :, :, SHEET.start :] = projector_point @ (turn @ by)
         block[1] -= self._slope @ block[0]
         residual = np.empty((2, n, 2))
         residual[0] = seen_camera - self._camera
@@ -289,8 +289,8 @@ def _prior_residuals(problem: Problem, x: Array) -> list[Prior]:
     s = SHEET.start
     for i, mean, sigma in ((s, 1.0, priors.sheet_scale), (s + 1, 1.0, priors.sheet_scale)):
         found.append(((x[i] - mean) / sigma, (i,), (1 / sigma,)))
-    bow = priors.sheet_bow * max(float(np.hypot(*problem.target.half_extent)), 1e-9)
-    found.append((x[s + 2] / bow, (s + 2,), (1 / bow,)))
+    bend = priors.sheet_bend * max(float(np.hypot(*problem.target.half_extent)), 1e-9)
+    found += [(x[i] / bend, (i,), (1 / bend,)) for i in range(s + 2, SHEET.stop)]
     if problem.length is not None:
         found.append(_length_residual(problem, problem.length, x))
     return found

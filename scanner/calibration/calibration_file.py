@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.calibration.problem import NAMES
+from scanner.calibration.problem import NAMES, SHEET
 from scanner.calibration.sheet import is_exact
 from scanner.calibration.solve import Solution, sigmas
 from scanner.calibration_id import content_id
@@ -19,6 +19,7 @@ from scanner.geometry import calibration_from_dict
 
 RIG_PARAMETERS = 24
 """Of NAMES: both lenses, rotation and translation. The sheet's are the target's business."""
+SHEET_KEYS = tuple(name.removeprefix("sheet.") for name in NAMES[SHEET])
 
 
 def calibration_dict(solution: Solution, created: str | None = None) -> dict[str, Any]:
@@ -41,9 +42,7 @@ def calibration_dict(solution: Solution, created: str | None = None) -> dict[str
         "warnings": list(solution.warnings),
         "target": {
             "spec": solution.target.spec,
-            "scale_x": float(solution.state.sheet[0]),
-            "scale_y": float(solution.state.sheet[1]),
-            "bow_mm": float(solution.state.sheet[2]),
+            **dict(zip(SHEET_KEYS, solution.state.sheet.tolist(), strict=True)),
             "sigma": _sheet_sigma(solution),
         },
         "warm_up": {
@@ -88,11 +87,11 @@ def _covariance(solution: Solution) -> dict[str, Any] | None:
 
 
 def _sheet_sigma(solution: Solution) -> dict[str, float] | None:
-    """Of the sheet's scales and bow, 1 sigma; None where none were fitted, or no covariance is known."""
+    """Of the sheet's scales and bends, 1 sigma; None where none were fitted, or no covariance is known."""
     sigma = sigmas(solution.adjusted)["sheet"]
     if is_exact(solution.problem.priors) or not np.isfinite(sigma).all():
         return None
-    return dict(zip(("scale_x", "scale_y", "bow_mm"), sigma.tolist(), strict=True))
+    return dict(zip(SHEET_KEYS, sigma.tolist(), strict=True))
 
 
 def _scale(solution: Solution) -> Any:

@@ -33,7 +33,7 @@ class HeldOut:
 
     errors: (V,) px rms in the projector of each view, predicted by the others; NaN where not tried. misses: (V,) the
     same with points weighed by their sigmas (`Problem.typical_rms`). within: (V,) such figures by the rig that all of
-    them made. covariance: (27, 27) as the adjustment's, widened to how much the rig moves from view to view. widened:
+    them made. covariance: (29, 29) as the adjustment's, widened to how much the rig moves from view to view. widened:
     by how many times all sigmas were.
     """
 
@@ -103,7 +103,7 @@ def _widened(formal: Array, moved: Array, looser: Array, count: int) -> tuple[Ar
     contradict the others and bend it: what was seen there is added.
 
     Args:
-        formal: (27, 27). moved: (n, 27) parameters without one view, less those of all. looser: (n, 27, 27) covariances
+        formal: (29, 29). moved: (n, 29) parameters without one view, less those of all. looser: (n, 29, 29) covariances
             without it, less that of all. count: of views.
 
     Returns:

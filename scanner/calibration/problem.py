@@ -1,7 +1,7 @@
 """What an adjustment is given and what it seeks: views, priors, and the rig's parameters in one vector.
 
 The order of the vector: camera, projector (nine numbers each, see `lens_slopes`), rotation vector and translation
-from camera to projector, the target's sheet (scale x, scale y, bow), then six numbers for each pose.
+from camera to projector, the target's sheet (scale x, scale y, bow, saddle, twist), then six numbers for each pose.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ CAMERA = slice(0, 9)
 PROJECTOR = slice(9, 18)
 TURN = slice(18, 21)
 SHIFT = slice(21, 24)
-SHEET = slice(24, 27)
-POSES = 27
+SHEET = slice(24, 29)
+POSES = 29
 
 NAMES = (
     *(
@@ -36,6 +36,8 @@ NAMES = (
     "sheet.scale_x",
     "sheet.scale_y",
     "sheet.bow_mm",
+    "sheet.saddle_mm",
+    "sheet.twist_mm",
 )
 """Of the parameters that are no pose, in order."""
 
@@ -81,8 +83,8 @@ class Priors:
     """the same for p1 and p2: a lens of 1000 px half diagonal decentred by one px"""
     sheet_scale: float = 0.001
     """stretch of a printed sheet along x and y: printers feed paper to about 0.1 %"""
-    sheet_bow: float = 0.001
-    """bow of the sheet, share of its half diagonal: 0.2 mm for A4 on a board"""
+    sheet_bend: float = 0.001
+    """bow, saddle and twist of the sheet, each as a share of its half diagonal: 0.2 mm for A4 on a board"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +122,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """camera, projector: lenses; rotation, translation: camera to projector; sheet: scale x and y, bow mm;
+    """camera, projector: lenses; rotation, translation: camera to projector; sheet: (5,) of `sheet_points`;
     poses: (V, 6) rotation vector and translation, mm, target to camera."""
 
     camera: Lens
@@ -149,12 +151,28 @@ class State:
 
 
 def sheet_points(target: Target, sheet: Array) -> tuple[Array, Array]:
-    """(N, 3) mm of the target's points on a sheet stretched and bowed, and (N, 3, 3) by its three quantities."""
+    """The target's points on a sheet that is stretched and bent.
+
+    A bend is any surface of second order: a bowl, a roll about any axis (paper that was on one), a saddle. Three
+    quantities make it up, which have nothing to do with one another over a square: bow (x^2 + y^2) / h^2, saddle
+    (x^2 - y^2) / h^2, and twist 2 x y / h^2, with h the half diagonal.
+
+    Args:
+        sheet: (5,) scale x, scale y, bow, saddle and twist, mm.
+
+    Returns:
+        (N, 3) mm, and (N, 3, 5) slopes by the five.
+    """
     points = target.points
     half = max(float(np.hypot(*target.half_extent)), 1e-9)
-    shape = (points[:, 0] ** 2 + points[:, 1] ** 2) / half**2
+    x, y = points[:, 0] / half, points[:, 1] / half
+    shapes = np.column_stack((x * x + y * y, x * x - y * y, 2 * x * y))
     moved = points * (sheet[0], sheet[1], 1.0)
-    moved[:, 2] += sheet[2] * shape
-    slopes = np.zeros((len(points), 3, 3))
-    slopes[:, 0, 0], slopes[:, 1, 1], slopes[:, 2, 2] = points[:, 0], points[:, 1], shape
+    moved[:, 2] += shapes @ sheet[2:]
+    slopes = np.zeros((len(points), 3, 5))
+    slopes[:, 0, 0], slopes[:, 1, 1], slopes[:, 2, 2:] = points[:, 0], points[:, 1], shapes
     return moved, slopes
+
+
+FLAT = np.array([1.0, 1.0, 0.0, 0.0, 0.0])
+"""The sheet as it was meant to be. Not to be written into."""

@@ -135,7 +135,7 @@ def adjusted_length(problem: Problem, state: State, covariance: Array) -> tuple[
 
 
 def is_exact(priors: Priors) -> bool:
-    """Whether no stretch and no bow are fitted."""
+    """Whether no stretch and no bend are fitted."""
     return priors.sheet_scale < EXACT
 
 

@@ -62,7 +62,7 @@ class SolveOptions:
     """What a user may state.
 
     length: (mm, 1-sigma mm) of the target's longest row of points, first to last; without it the scale is unverified.
-    rigid: the target's sheet neither stretches nor bows (glass, metal). baseline_mm, distance_mm: entered to be
+    rigid: the target's sheet neither stretches nor bends (glass, metal). baseline_mm, distance_mm: entered to be
     checked against. warm_up_minutes: how long the rig had been on.
     """
 
@@ -250,7 +250,7 @@ def priors_of(options: SolveOptions, target: Target) -> Priors:
     """How far a target may be from its nominal points: prints a thousandth, others not at all."""
     if not options.rigid and target.flat:
         return Priors()
-    return Priors(sheet_scale=1e-7, sheet_bow=1e-7)
+    return Priors(sheet_scale=1e-7, sheet_bend=1e-7)
 
 
 def _warnings(solution: Solution) -> list[str]:
@@ -314,7 +314,7 @@ def _bending(solution: Solution) -> list[str]:
 
 
 def sigmas(adjusted: Adjusted) -> Mapping[str, Array]:
-    """1-sigma of the parameters, by group: camera, projector (9,), rotation, translation (3,), sheet (3,)."""
+    """1-sigma of the parameters, by group: camera, projector (9,), rotation, translation (3,), sheet (5,)."""
     spread = np.sqrt(np.clip(np.diag(adjusted.covariance), 0, None))
     groups = {"camera": CAMERA, "projector": PROJECTOR, "rotation": TURN, "translation": SHIFT, "sheet": SHEET}
     return {name: spread[part] for name, part in groups.items()}

@@ -21,7 +21,7 @@ from scanner.calibration.held_out import HeldOut
 from scanner.calibration.lens_slopes import rotation_of, vector_of
 from scanner.calibration.observe import LeftOut, Observation, warm_up_of, warnings_of
 from scanner.calibration.plausibility import MOST_RELATIVE_SIGMA, Facing, check_facing, check_stated
-from scanner.calibration.problem import POSES, Problem, State, View, sheet_points
+from scanner.calibration.problem import FLAT, POSES, Problem, State, View, sheet_points
 from scanner.calibration.sheet import contradiction, stated_length
 from scanner.calibration.solve import Progress, Solution, SolveOptions, epipolar_errors, priors_of, solve
 from scanner.calibration.targets import FEWEST_DISCS, Target
@@ -178,7 +178,7 @@ def _parts(fit: _Fit, observation: Observation) -> tuple[State, dict[str, list[f
         Lens(observation.projector_size, projector.matrix, np.zeros(5)),
         rotation,
         translation,
-        np.array([1.0, 1.0, 0.0]),
+        FLAT.copy(),
         pose[None],
     )
     back = camera.rotation.T

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from scanner.calibration.hall import decompose, hall_matrix, project_hall
 from scanner.calibration.lens_slopes import rotation_of
-from scanner.calibration.problem import State, View
+from scanner.calibration.problem import FLAT, State, View
 from scanner.calibration.targets import Target
 from scanner.errors import CalibrationError
 from scanner.geometry import Lens
@@ -71,9 +71,8 @@ def start(
             break
         position, why = bad
         left_out[used.pop(position)] = why
-    sheet = np.array([1.0, 1.0, 0.0])
     return Start(
-        State(camera, projector, rotation, translation, sheet, poses), tuple(used), left_out, float(errors.max())
+        State(camera, projector, rotation, translation, FLAT.copy(), poses), tuple(used), left_out, float(errors.max())
     )
 
 

@@ -48,7 +48,7 @@ Length = Annotated[
         "(else 0.1).",
     ),
 ]
-Rigid = Annotated[bool, typer.Option("--rigid", help="The target is glass or metal: no stretch and no bow are fitted.")]
+Rigid = Annotated[bool, typer.Option("--rigid", help="The target is glass or metal: it neither stretches nor bends.")]
 Baseline = Annotated[
     float | None,
     typer.Option(
@@ -299,10 +299,11 @@ def _sheet(solution: Solution) -> str:
     from scanner.calibration.solve import sigmas  # noqa: PLC0415
 
     if is_exact(solution.problem.priors):
-        return "taken as exact: no stretch and no bow are fitted"
-    x, y, bow = (_stated(v, e) for v, e in zip(solution.state.sheet, sigmas(solution.adjusted)["sheet"], strict=True))
+        return "taken as exact: no stretch and no bend are fitted"
+    spreads = sigmas(solution.adjusted)["sheet"]
+    x, y, bow, saddle, twist = (_stated(v, e) for v, e in zip(solution.state.sheet, spreads, strict=True))
     unmeasured = "" if solution.problem.length is not None else "; its size is that of prints, not measured"
-    return f"scale x {x}, scale y {y} of its nominal size, bow {bow} mm{unmeasured}"
+    return f"scale x {x}, scale y {y} of its nominal size, bow {bow}, saddle {saddle}, twist {twist} mm{unmeasured}"
 
 
 def _scale(solution: Solution) -> str:

@@ -19,7 +19,7 @@ from scanner.calibration.lens_slopes import lens_numbers, vector_of
 from scanner.calibration.observe import LeftOut, Observation
 from scanner.calibration.panel import SIZE, ticks
 from scanner.calibration.pictures import HEAD_PX, draw
-from scanner.calibration.problem import POSES, Length, Problem, State, View
+from scanner.calibration.problem import FLAT, POSES, Length, Problem, State, View
 from scanner.calibration.sheet import contradiction, stated_length
 from scanner.calibration.solve import Solution, SolveOptions, priors_of, sigmas, solve, thinned
 from scanner.calibration.targets import parse_target
@@ -101,7 +101,9 @@ def test_errors_common_to_a_view_widen_the_covariance() -> None:
 def test_jacobian_is_that_of_the_residuals() -> None:
     views = tuple(view_of(RIG, pose, f"v{k}") for k, pose in enumerate(poses(3)))
     problem = Problem(TARGET, RIG.camera.size, RIG.projector.size, views)
-    state = State(RIG.camera, RIG.projector, RIG.rotation, RIG.translation, np.array([1.001, 0.999, 0.4]), poses(3))
+    state = State(
+        RIG.camera, RIG.projector, RIG.rotation, RIG.translation, np.array([1.001, 0.999, 0.4, -0.3, 0.2]), poses(3)
+    )
     equations, x = Equations(problem, (0.02, 1.0)), state.vector()
     dense = equations.evaluate(x)[1]
     rows = slice(0, sum(4 * len(v.ids) for v in views))
@@ -117,7 +119,7 @@ def test_jacobian_is_that_of_the_residuals() -> None:
 def test_large_problems_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
     views = [one.view for one in observations(RIG, poses(5))]
     assert all(len(view.ids) == 54 for view in thinned(views))
-    monkeypatch.setattr("scanner.calibration.solve.MOST_ENTRIES", 4 * 5 * 27 * 57)
+    monkeypatch.setattr("scanner.calibration.solve.MOST_ENTRIES", 4 * 5 * 27 * (POSES + 30))
     assert [len(view.ids) for view in thinned(views)] == [27] * 5
 
 
@@ -126,6 +128,19 @@ def test_stretched_sheet_is_found() -> None:
     found = calibrate(TARGET, stretched, LENGTH)
     assert found.state.sheet[1] == pytest.approx(1.002, abs=2e-4)
     assert found.state.translation == pytest.approx(RIG.translation, abs=0.3)
+
+
+@pytest.mark.parametrize("shape", ["rolled along a diagonal", "saddle"])
+def test_a_sheet_bent_in_any_way_is_found(shape: str) -> None:
+    x, y = TARGET.points[:, :2].T / float(np.hypot(*TARGET.half_extent))
+    depth = 0.4 * ((x + y) ** 2 / 2 if shape != "saddle" else x * x - y * y)
+    bent = replace(TARGET, points=TARGET.points + np.outer(depth, (0, 0, 1)))
+    found = calibrate(TARGET, observations(RIG, poses(6), target=bent), LENGTH)
+    asked = (0.2, 0.0, 0.2) if shape != "saddle" else (0.0, 0.4, 0.0)
+    assert found.state.sheet[2:] == pytest.approx(asked, abs=0.02)
+    off = np.abs(found.state.translation - RIG.translation) / sigmas(found.adjusted)["translation"]
+    assert off.max() < 3
+    assert calibration_dict(found)["target"]["twist_mm"] == found.state.sheet[4]
 
 
 def test_scale_is_the_stated_length_or_unverified(solution: Solution, capsys: pytest.CaptureFixture[str]) -> None:
@@ -396,7 +411,7 @@ def test_measured_independently_without_slopes() -> None:
 
 def test_adjustment_holds_what_is_fixed() -> None:
     views = tuple(view_of(RIG, pose, f"v{k}") for k, pose in enumerate(poses(6)))
-    state = State(RIG.camera, RIG.projector, RIG.rotation, RIG.translation, np.array([1.0, 1.0, 0.0]), poses(6))
+    state = State(RIG.camera, RIG.projector, RIG.rotation, RIG.translation, FLAT.copy(), poses(6))
     held = adjust(Problem(TARGET, RIG.camera.size, RIG.projector.size, views, fixed=(0, 1, 24, 25, 26)), state)
     assert held.state.camera.matrix[0, 0] == RIG.camera.matrix[0, 0]
     assert held.covariance[0, 0] == 0
