@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -202,12 +202,7 @@ def calibration_from_dict(content: Any, name: str = "calibration") -> Calibratio
     odd += pixel_warnings(camera, f"{name}: camera")
     rotation = _matrix(content.get("rotation"), (3, 3), f"{name}: rotation")
     translation = _matrix(content.get("translation"), (3,), f"{name}: translation")
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
-        raise CalibrationError(
-            f"{name}: rotation is not a rotation (orthonormal, determinant +1): its determinant is "
-            f"{np.linalg.det(rotation):.4g}",
-            hint="nine numbers, unrounded; where a picture is mirrored, mirror it in the rig file",
-        )
+    _require_rotation(rotation, f"{name}: rotation")
     if np.linalg.norm(translation) < 1e-9:
         raise CalibrationError(
             f"{name}: translation is zero: projector and camera cannot stand at the same place",
@@ -322,20 +317,9 @@ def _covariance_warnings(content: Mapping[str, Any], name: str) -> list[str]:
 
 def _check_optional(content: Mapping[str, Any], name: str) -> None:
     """Raise CalibrationError where an optional member that this program may use is there and malformed."""
-    shapes: dict[str, dict[str, tuple[int, ...]]] = {
-        "hall": {"camera": (3, 4), "projector": (3, 4)},
-        "world": {"rotation": (3, 3), "translation": (3,)},
-    }
-    for key, members in shapes.items():
-        member = content.get(key)
-        if member is None:
-            continue
-        if not isinstance(member, dict):
-            raise CalibrationError(f"{name}: {key} must be null or an object, got {member!r:.80}")
-        for part, shape in members.items():
-            numbers = _matrix(member.get(part), shape, f"{name}: {key}.{part}")
-            if key == "hall":
-                check_hall(numbers, f"{name}: hall.{part}")
+    _check_parts(content, "hall", {"camera": (3, 4), "projector": (3, 4)}, check_hall, name)
+    _check_parts(content, "world", {"rotation": (3, 3)}, _require_rotation, name)
+    _check_parts(content, "world", {"translation": (3,)}, None, name)
     phase = content.get("mcp_phase")
     if phase is not None:
         if not isinstance(phase, dict):
@@ -355,6 +339,33 @@ def _check_optional(content: Mapping[str, Any], name: str) -> None:
         raise CalibrationError(f"{name}: residuals must be null or an object, got {residuals!r:.80}")
     if residuals is not None and residuals.get("epipolar_px") is not None:
         _matrix(residuals["epipolar_px"], (), f"{name}: residuals.epipolar_px")
+
+
+def _check_parts(
+    content: Mapping[str, Any],
+    key: str,
+    shapes: Mapping[str, tuple[int, ...]],
+    check: Callable[[Array, str], None] | None,
+    name: str,
+) -> None:
+    """The same of one member that is null or an object of arrays."""
+    member = content.get(key)
+    if member is None:
+        return
+    if not isinstance(member, dict):
+        raise CalibrationError(f"{name}: {key} must be null or an object, got {member!r:.80}")
+    for part, shape in shapes.items():
+        numbers = _matrix(member.get(part), shape, f"{name}: {key}.{part}")
+        if check is not None:
+            check(numbers, f"{name}: {key}.{part}")
+
+
+def _require_rotation(matrix: Array, name: str) -> None:
+    if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-4 or np.linalg.det(matrix) < 0:
+        raise CalibrationError(
+            f"{name} is not a rotation (orthonormal, determinant +1): its determinant is {np.linalg.det(matrix):.4g}",
+            hint="nine numbers, unrounded; where a picture is mirrored, mirror it in the rig file",
+        )
 
 
 def _matrix(content: Any, shape: tuple[int, ...], name: str) -> Array:

@@ -212,12 +212,12 @@ def _in_mm(cause: Contribution, per_px: float) -> Contribution:
 
 def _calibration(scan: Scan, calibration: Calibration, axis: Axis) -> Contribution:
     spread = depth_spread(calibration, scan, axis)
-    scale = calibration.extra.get("scale")
     if spread is None:
         has = calibration.extra.get("covariance") is not None
         says = f"the calibration {'has no covariance that can be read' if has else 'has no covariance'}"
         return Contribution("calibration", "systematic", None, None, says)
-    unverified = "; its absolute scale is unverified" if scale == "unverified" else ""
+    verified = stated_length_of(calibration.extra.get("scale")) is not None
+    unverified = "" if verified else "; its absolute scale is unverified"
     return Contribution("calibration", "systematic", None, spread, f"covariance of the calibration{unverified}")
 
 
