@@ -174,7 +174,7 @@ def _split_words(every: Agreed, group: Agreed) -> str:
     return (
         f"views contradict each other, and no majority says which are right: {group.left_px:.3f} px are left of "
         f"{names} alone, {every.left_px:.3f} px of all {len(every.problem.views)}. Was camera, projector or lens moved "
-        "between them? Calibrate with those of one time"
+        "between them, or another target shown, one printed anew? Calibrate with those of one time and one target"
     )
 
 

@@ -14,6 +14,8 @@ from scanner.sequencer.findings import Array, equal_positions, middle
 
 DARK_HINT = "is the lens cap off, the projector on and awake, and the exposure long enough?"
 
+FILLED_HINT = "shorten the exposure, close the lens, lower the gain or darken the room"
+
 BRIGHTEST, NOISE_LIFTS = 0.995, 2.58
 """Quantile of the pixels that stands for the brightest place, since a few may glint; and by how many sigmas noise alone
 lifts it (normal distribution)."""
@@ -40,7 +42,7 @@ def why_dark(
     for light, positions in equal_positions(sequence):
         here = [frames[p] for p in positions if p in frames]
         if not here:
-            return nothing, DARK_HINT
+            return _always_filled(frames, max_value) or (nothing, DARK_HINT)
         levels[light] = middle(here)
         # A median of n has the variance of a mean of n, times up to pi / 2.
         sigma = float(np.hypot(sigma, noise * np.sqrt(np.pi / 2 / len(here))))
@@ -50,7 +52,7 @@ def why_dark(
         return (
             f"{filled:.0%} of the camera's pixels are saturated without the projector's light: other light is too "
             "strong, or the exposure too long",
-            "shorten the exposure, close the lens, lower the gain or darken the room",
+            FILLED_HINT,
         )
     added, other = float(np.quantile(on - off, BRIGHTEST)) - NOISE_LIFTS * sigma, float(np.median(off))
     if added < SEEN_SIGMAS * sigma:
@@ -65,3 +67,12 @@ def why_dark(
         says += f"; other light makes {other:.0f}"
         hint += ", and darken the room"
     return says, hint
+
+
+def _always_filled(frames: Mapping[int, Array], max_value: int) -> tuple[str, str] | None:
+    """The same of frames none of which is known to be without light."""
+    filled = float(np.mean(np.min(list(frames.values()), axis=0) >= max_value)) if frames else 0.0
+    if filled <= MOST_FILLED:
+        return None
+    says = f"{filled:.0%} of the camera's pixels are saturated in every frame: the exposure is too long"
+    return f"{says}, or other light too strong", FILLED_HINT

@@ -146,6 +146,9 @@ def test_captures_from_elsewhere_are_judged_by_what_they_have() -> None:
     assert any("no order bars" in text for text in found.cannot_reveal)
     rotated = witness(bare, dict(enumerate([*shown[:3], shown[4], shown[5], shown[3]])), 255)
     assert not rotated.passed
+    white = witness(bare, {n: np.full_like(frame, 255) for n, frame in enumerate(shown)}, 255)
+    assert white.dark
+    assert "saturated in every frame" in str(sync_error(bare, (), white, ()))
 
 
 # --- disorder ----------------------------------------------------------------------------------------------------
