@@ -31,7 +31,7 @@ from scanner.errors import DecodeError, ScannerError
 from scanner.geometry import Calibration, load_calibration
 from scanner.patterns import FrameRole, GrayPattern, GrayPmpPattern, McpPattern, PatternSequence, PmpPattern
 from scanner.ripple_correction import widen_by_ripple, without_ripple
-from scanner.saturation import overexposed
+from scanner.saturation import clips_below, overexposed
 from scanner.scale_check import require_codes_within, require_geometry
 from scanner.scan import Map, Scan, build_scan
 from scanner.scan_report import report_of_capture, report_of_check
@@ -241,7 +241,8 @@ class Reconstruction:
         """Maps and points."""
         tell("decoding")
         decoded = self._decoded()
-        decoded = replace(decoded, warnings=(*decoded.warnings, *capture.warnings, *overexposed(decoded, capture)))
+        of_light = overexposed(decoded, capture) + clips_below(capture)
+        decoded = replace(decoded, warnings=(*decoded.warnings, *capture.warnings, *of_light))
         require_codes_within(decoded, self._header.sequence)
         if len(self._header.sequence) > 1:
             # The witnesses have seen light: without it the check ends in an error of its own.

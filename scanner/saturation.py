@@ -36,6 +36,10 @@ Ten times too bright are eight of ten: more cannot be told by counting."""
 PERCENTILE = 99.5
 """Of the pixels' brightness, as automatic exposure has it."""
 
+PILED, NEXT, OVER_NEXT = 0.005, 20, 2.0
+"""Share of the samples that lie at the brightest level of all, and how many times as many as in the twentieth below it:
+a cosine has twice as many there as here, and noise makes these fewer."""
+
 _EVERY, _BLOCK = 8, 4
 """Pixels from sample to sample, and samples each way that are counted together. Of one pixel's eight shifts a whole
 number is saturated; its neighbours' phases differ, and the mean is the share that the brightness makes."""
@@ -60,6 +64,29 @@ def overexposed(decoded: Decoded, capture: Capture) -> tuple[str, ...]:
     return (
         f"{OVEREXPOSED}{clipped / shows:.1%} of the pixels in which the pattern shows are saturated and have no value: "
         f"{advice}{automatic}, lower the gain, or close the lens",
+    )
+
+
+def clips_below(capture: Capture) -> tuple[str, ...]:
+    """What to say where fringes are cut off at a level below the camera's last one, which no decoder takes for
+    saturated: video levels that end at 235, a sensor that is full before its converter; () where none are."""
+    header = capture.header
+    present = [p for p in header.sequence.fringes if p in capture.records]
+    if not isinstance(header.sequence.pattern, PmpPattern) or not present:
+        return ()
+    counts, every, last = np.zeros(header.camera.max_value + 1, np.int64), 2 * _EVERY, header.camera.max_value
+    for p in present:
+        counts += np.bincount(capture.frame(p)[::every, ::every].reshape(-1), minlength=last + 1)[: last + 1]
+    top = int(np.flatnonzero(counts)[-1]) if counts.any() else 0
+    if top >= CLIP * last:
+        return ()
+    share, below = counts[top] / counts.sum(), int(counts[top - max(top // NEXT, 1) : top].sum())
+    if share < PILED or counts[top] < OVER_NEXT * below:
+        return ()
+    return (
+        f"cut off: {share:.1%} of the samples are {top} of {last} and none is brighter, as if the camera ended there "
+        "(video levels, a lookup table, a full sensor): what lies above is lost, and no pixel counts as saturated. "
+        f"Expose for less, so that the brightest stays below {top}, or set the camera to its full range",
     )
 
 

@@ -14,7 +14,7 @@ from scanner.decode import Reason
 from scanner.empty_scan import raise_if_empty
 from scanner.errors import DecodeError
 from scanner.patterns import GrayPattern, Pattern, PatternSequence, PmpPattern, ProjectorSize
-from scanner.saturation import overexposed
+from scanner.saturation import clips_below, overexposed
 
 PMP = PmpPattern()
 SIZE = (64, 512)
@@ -89,3 +89,20 @@ def test_a_scan_without_a_value_says_once_what_to_do_about_light() -> None:
         with pytest.raises(DecodeError, match="20 clipped") as error:
             raise_if_empty(SimpleNamespace(reason=clipped, warnings=warnings))  # type: ignore[arg-type]
         assert error.value.hint == hint
+
+
+@pytest.mark.parametrize(("brightness", "level", "said"), [(0.95, 200, True), (1.2, 235, True), (0.7, 235, False)])
+def test_fringes_cut_off_below_the_last_level_are_named(brightness: float, level: int, said: bool) -> None:
+    whole, noise = capture(brightness), np.random.default_rng(3).normal(0, 1, SIZE[::-1])
+
+    def limited(position: int) -> Any:
+        return np.minimum(whole.frame(position) + noise, level).clip(0).astype(np.uint8)
+
+    cut = SimpleNamespace(header=whole.header, records=whole.records, frame=limited)
+    found = clips_below(cut)
+    assert bool(found) == said
+    assert not said or f"are {level} of 255 and none is brighter" in found[0]
+
+
+def test_cosines_that_end_where_they_are_highest_are_not_cut_off() -> None:
+    assert clips_below(capture(0.6)) == clips_below(capture(0.9)) == ()
