@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import errno
 import io
+import json
 import os
 import stat
 from pathlib import Path
+from typing import Any
 
 MAX_SMALL_BYTES = 64 << 20
 """The most that a JSON or JSON Lines file may have: a line of frames.jsonl takes 350 bytes, and a capture of 100,000
@@ -42,6 +44,26 @@ def read_small_text(path: Path, limit: int = MAX_SMALL_BYTES, encoding: str = "u
         UnicodeDecodeError: it is no text.
     """
     return io.TextIOWrapper(io.BytesIO(read_small(path, limit)), encoding=encoding).read()
+
+
+def read_small_json(path: Path) -> Any:
+    """What a JSON file says that people edit: a member that is there twice, an old line left beside the new one, would
+    be the last one's without a word.
+
+    Raises:
+        OSError: see `read_small`.
+        ValueError: it is no JSON, or an object has a member twice. RecursionError: it is nested too deeply.
+    """
+    return json.loads(read_small_text(path), object_pairs_hook=_once)
+
+
+def _once(members: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(members)
+    if len(found) < len(members):
+        names = [name for name, _ in members]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{twice!r:.80} is there twice")
+    return found
 
 
 def _opener(path: str, flags: int) -> int:

@@ -7,7 +7,6 @@ Distortion is Brown's (1966) with OpenCV's order k1, k2, p1, p2, k3. Triangulati
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.bounded_files import read_small_text
+from scanner.bounded_files import read_small_json
 from scanner.calibration_id import content_id, id_warnings
 from scanner.covariance import read_covariance, taken_as_exact
 from scanner.credible import check_hall, check_response, check_slope, lens_warnings, pixel_warnings, rig_warnings
@@ -166,12 +165,12 @@ def load_calibration(path: Path) -> Calibration:
         CalibrationError: unreadable, of another format or version, or not a geometry (NaN, singular, mirrored).
     """
     try:
-        content = json.loads(read_small_text(path))
+        content = read_small_json(path)
         odd = id_warnings(content, path.name) if isinstance(content, dict) else []
     except OSError as error:
         raise CalibrationError(f"cannot read calibration {path}: {error.strerror}", hint=_MAKE) from error
     except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"{path} is not JSON: {error}", hint=_MAKE) from error
+        raise CalibrationError(f"{path} cannot be read as JSON: {error}", hint=_MAKE) from error
     found = calibration_from_dict(content, name=str(path))
     # Errors say where the file is; warnings go into reports, which are read elsewhere.
     return replace(found, warnings=(*(said.replace(str(path), path.name) for said in found.warnings), *odd))
@@ -360,6 +359,13 @@ def _check_parts(
             check(numbers, f"{name}: {key}.{part}")
 
 
+def _all_numbers(content: Any) -> bool:
+    """Whether nothing in nested lists is text or true, which NumPy would take for numbers."""
+    if isinstance(content, list | tuple):
+        return all(_all_numbers(part) for part in content)
+    return not isinstance(content, bool | str)
+
+
 def _require_rotation(matrix: Array, name: str) -> None:
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-4 or np.linalg.det(matrix) < 0:
         raise CalibrationError(
@@ -371,6 +377,8 @@ def _require_rotation(matrix: Array, name: str) -> None:
 def _matrix(content: Any, shape: tuple[int, ...], name: str) -> Array:
     if content is None:
         raise CalibrationError(f"{name} is missing", hint=_MAKE)
+    if not _all_numbers(content):
+        raise CalibrationError(f"{name} is not an array of numbers", hint="numbers without quotes")
     try:
         array = np.asarray(content, dtype=np.float64)
     except (ValueError, TypeError, OverflowError) as error:

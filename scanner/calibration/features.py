@@ -6,9 +6,14 @@ What the figures are called and what may be left out of them is `verification`'s
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from scanner.calibration.edges import NO_POINTS
+from scanner.errors import DecodeError
 
 Array = NDArray[np.float64]
 
@@ -21,6 +26,37 @@ belong to it, and once in fifty if a fifth does."""
 GROSS_SPREADS = 8.0
 """Distance from the feature, in units of the median one, from which a point belongs to something else."""
 SAMPLE = 20_000
+FEWEST_POINTS = 500
+"""Of a feature that is measured"""
+
+
+@dataclass(frozen=True, eq=False)
+class FeaturePoints:
+    """Of a scan, those that belong to one feature. points: (n, 3) mm; at: (n,) their places in the scan, flat; used:
+    share of the scan's points; left_out: see `Probing`; another_mm: diameter of another ball in
+    the scan, None where there is none."""
+
+    points: Array
+    at: NDArray[np.intp]
+    used: float
+    left_out: float = 0.0
+    another_mm: float | None = None
+
+
+def finite_points(xyz: NDArray[Any]) -> tuple[Array, NDArray[np.intp]]:
+    """(n, 3) points, and (n,) their places in the scan.
+
+    Raises:
+        DecodeError: there are too few to measure anything by.
+    """
+    flat = np.asarray(xyz).reshape(-1, 3)
+    at = np.flatnonzero(np.isfinite(flat).all(axis=1))
+    points: Array = flat[at].astype(np.float64)
+    if len(points) < FEWEST_POINTS:
+        raise DecodeError(
+            f"{len(points)} points are too few to measure a feature by, {FEWEST_POINTS} are needed", hint=NO_POINTS
+        )
+    return points, at
 
 
 def spread(off: Array, left_out: float) -> float:

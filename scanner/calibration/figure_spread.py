@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, norm, qmc
 
 from scanner.calibration.detection import Detection
-from scanner.calibration.features import plane_through, sphere_through, spread
+from scanner.calibration.features import FeaturePoints, plane_through, sphere_through, spread
 from scanner.calibration.targets import Target
 from scanner.calibration.verification import (
     LEFT_OUT,
     OF_SHELL,
-    FeaturePoints,
     board_figures,
     local_point,
     local_weights,

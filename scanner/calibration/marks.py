@@ -7,7 +7,6 @@ nothing but it is seen. A mark that is hidden in a scan is said to be, and is no
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
@@ -18,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.bounded_files import read_small_text
+from scanner.bounded_files import read_small_json
 from scanner.calibration.discs import disc_centres
 from scanner.calibration.verification import local_point, plane_of
 from scanner.errors import CalibrationError, DecodeError
@@ -213,11 +212,11 @@ def load_marks(path: Path) -> Marks:
         CalibrationError: it is not there, or no such file.
     """
     try:
-        content = json.loads(read_small_text(path))
+        content = read_small_json(path)
     except OSError as error:
         raise CalibrationError(f"cannot read marks {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"marks {path} is not JSON: {error}") from error
+        raise CalibrationError(f"marks {path} cannot be read as JSON: {error}") from error
     return parse_marks(content, f"marks {path}")
 
 

@@ -6,7 +6,6 @@ is `target_svg`'s, finding it in a picture `detection`'s. A wedge or any other b
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.bounded_files import read_small_text
+from scanner.bounded_files import read_small_json
 from scanner.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -120,11 +119,11 @@ def load_discs(path: Path) -> Target:
         ConfigError: unreadable, or not such a file.
     """
     try:
-        content = json.loads(read_small_text(path))
+        content = read_small_json(path)
     except OSError as error:
         raise ConfigError(f"cannot read target {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"target {path} is not JSON: {error}") from error
+        raise ConfigError(f"target {path} cannot be read as JSON: {error}") from error
     if not isinstance(content, dict) or content.get("format") != "fringed-target" or content.get("version") != 1:
         raise ConfigError(f"target {path} is no fringed-target file of version 1", hint=DISCS_FILE)
     points = _vectors(content.get("points"), f"target {path}: points")

@@ -14,14 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.calibration.balls import sphere_points
 from scanner.calibration.detection import Detection, NotFound, detect
-from scanner.calibration.edges import NO_POINTS
 from scanner.calibration.features import (
+    FEWEST_POINTS,
     Array,
+    FeaturePoints,
     belonging,
+    finite_points,
     plane_distance,
     plane_through,
-    sphere_distance,
     sphere_through,
     spread,
 )
@@ -35,18 +37,6 @@ LEFT_OUT = 0.003
 """Share of points that may be left out (VDI/VDE 2634-2, 2012, sec. 6)."""
 OF_SHELL = 0.05
 """Share that the shell of `Probing.shell_mm` leaves out (P_Form.Sph.D95% of ISO 10360-8:2013, and of -13:2021)."""
-FEWEST_POINTS = 500
-OTHER_SIZES = 1.2 ** np.arange(-5.0, 6.0)
-"""Where there is no sphere of the diameter given, one of so many times that is looked for, each to a tenth: a radius
-taken for a diameter, and scales that are wrong by as much"""
-OTHER_SAMPLE = 4000
-"""Points of a scan that are asked for it"""
-OUTLINE = 0.9
-"""Of a ball's radius: rays that pass it nearer than that see nothing else, however blurred its edge is."""
-SAME_SIZE = 0.02
-"""Of the diameter: as much as the best sphere through a hundred points is off"""
-ROUND_SHARE = 0.02
-"""Of its diameter, rms: what fits a sphere worse is something else that is round, as a head (4 to 7 %)"""
 
 
 @dataclass(frozen=True)
@@ -69,7 +59,7 @@ class Probing:
     """A sphere. form_mm: spread of the radial distances, 99.7 % of the points (PF); shell_mm: the same of 95 % (the
     dispersion of ISO 10360-8 and -13); size_mm: diameter less the stated one (PS), None where none was stated;
     rms_mm: of the radial distances; left_out: share of the points seen within the ball's outline that no figure
-    contains, since they lie too far off it."""
+    contains, since they lie too far off it; another_mm: diameter of another ball in the scan, None where none is."""
 
     form_mm: float
     shell_mm: float
@@ -80,6 +70,7 @@ class Probing:
     points: int
     used: float
     left_out: float
+    another_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -103,17 +94,6 @@ class Repeatability:
     points: int
 
 
-@dataclass(frozen=True, eq=False)
-class FeaturePoints:
-    """Of a scan, those that belong to one feature. points: (n, 3) mm; at: (n,) their places in the scan, flat; used:
-    share of the scan's points; left_out: see `Probing`."""
-
-    points: Array
-    at: NDArray[np.intp]
-    used: float
-    left_out: float = 0.0
-
-
 def flat_board(xyz: NDArray[Any]) -> Flatness:
     """Measure a flat board.
 
@@ -128,7 +108,7 @@ def flat_board(xyz: NDArray[Any]) -> Flatness:
 
 def board_points(xyz: NDArray[Any]) -> FeaturePoints:
     """The points of the largest plane. Args, Raises: as `flat_board`."""
-    points, at = _finite(xyz)
+    points, at = finite_points(xyz)
     used = belonging(points, plane_distance, 3)
     return FeaturePoints(points[used], at[used], float(used.mean()))
 
@@ -180,27 +160,6 @@ def sphere(xyz: NDArray[Any], diameter_mm: float | None = None) -> Probing:
     return measured_sphere(sphere_points(xyz, diameter_mm), diameter_mm)
 
 
-def sphere_points(xyz: NDArray[Any], diameter_mm: float | None = None) -> FeaturePoints:
-    """The points of a sphere. Args, Raises: as `sphere`."""
-    points, at = _finite(xyz)
-    reach = 0.7 * diameter_mm if diameter_mm is not None else 0.3 * float(np.ptp(points, axis=0).max())
-    used = belonging(points, sphere_distance(diameter_mm), 4, reach)
-    if used.sum() < FEWEST_POINTS:
-        raise _no_sphere(points, int(used.sum()), diameter_mm)
-    figures = sphere_figures(points[used])
-    if figures["rms_mm"] > ROUND_SHARE * figures["diameter_mm"]:
-        raise _no_sphere(points, 0, diameter_mm)
-    seen = _within_outline(points, *sphere_through(points[used]))
-    return FeaturePoints(points[used], at[used], float(used.mean()), float((seen & ~used).sum() / max(seen.sum(), 1)))
-
-
-def _within_outline(points: Array, centre: Array, radius: float) -> NDArray[np.bool_]:
-    """Points on rays from the camera, which is at 0, that pass well within a ball."""
-    rays = points / np.linalg.norm(points, axis=1)[:, None]
-    beside = np.linalg.norm(centre - (rays @ centre)[:, None] * rays, axis=1)
-    return np.asarray(beside < OUTLINE * radius)
-
-
 def measured_sphere(on: FeaturePoints, diameter_mm: float | None = None) -> Probing:
     """Measure a sphere by its points."""
     figures = sphere_figures(on.points)
@@ -212,6 +171,7 @@ def measured_sphere(on: FeaturePoints, diameter_mm: float | None = None) -> Prob
         points=len(on.points),
         used=on.used,
         left_out=on.left_out,
+        another_mm=on.another_mm,
     )
 
 
@@ -336,49 +296,3 @@ def local_weights(
 def plain(result: Any) -> dict[str, Any]:
     """A result as plain data."""
     return asdict(result)
-
-
-def _finite(xyz: NDArray[Any]) -> tuple[Array, NDArray[np.intp]]:
-    """(n, 3) points, and (n,) their places in the scan."""
-    flat = np.asarray(xyz).reshape(-1, 3)
-    at = np.flatnonzero(np.isfinite(flat).all(axis=1))
-    points: Array = flat[at].astype(np.float64)
-    if len(points) < FEWEST_POINTS:
-        raise DecodeError(
-            f"{len(points)} points are too few to measure a feature by, {FEWEST_POINTS} are needed", hint=NO_POINTS
-        )
-    return points, at
-
-
-def _no_sphere(points: Array, on_best: int, diameter_mm: float | None) -> DecodeError:
-    """The error for a sphere that is not there, with the one of another size that is. on_best: points on the best one,
-    fewer than are needed; 0 where these are enough, and not round."""
-    if diameter_mm is None:
-        return DecodeError(f"no sphere among the points: {on_best} lie on the best one")
-    few = points[:: -(-len(points) // OTHER_SAMPLE)]
-    for other in sorted(diameter_mm * OTHER_SIZES, key=lambda size: abs(float(np.log(size / diameter_mm)))):
-        used = belonging(few, sphere_distance(other), 4, 0.7 * other)
-        if used.sum() < FEWEST_POINTS // 5:
-            continue
-        centre, radius = sphere_through(few[used])
-        rms = float(np.sqrt(np.mean((np.linalg.norm(few[used] - centre, axis=1) - radius) ** 2)))
-        if rms < ROUND_SHARE * 2 * radius:
-            if on_best and abs(2 * radius / diameter_mm - 1) < SAME_SIZE:
-                return DecodeError(
-                    f"{on_best} points of the sphere of {diameter_mm:g} mm are too few to measure it by, "
-                    f"{FEWEST_POINTS} are needed",
-                    hint=NO_POINTS,
-                )
-            doubled = abs(radius / diameter_mm - 1) < 0.1
-            return DecodeError(
-                f"no sphere of {diameter_mm:g} mm diameter among the points; there is one of {2 * radius:.2f} mm "
-                f"({used.mean():.0%} of the points, {rms:.3f} mm rms)",
-                hint="give its diameter, not its radius"
-                if doubled
-                else "is that its diameter, in mm? Else the scale of the calibration is wrong",
-            )
-    return DecodeError(
-        f"no sphere of {diameter_mm:g} mm diameter among the points, and none of {OTHER_SIZES[0]:.1f} to "
-        f"{OTHER_SIZES[-1]:.1f} times that",
-        hint="if there is one, keep its surroundings out of the scan: fringed decode --box or --depth",
-    )

@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from scanner.calibration.balls import sphere_points
 from scanner.calibration.beyond_noise import beyond_noise
 from scanner.calibration.edges import edge_width
+from scanner.calibration.features import FeaturePoints
 from scanner.calibration.figure_spread import (
     BOARD,
     COVERAGE_FACTOR,
@@ -29,16 +31,15 @@ from scanner.calibration.marks import Marks, measured_marks
 from scanner.calibration.targets import Target
 from scanner.calibration.verification import (
     LEFT_OUT,
-    FeaturePoints,
     board_points,
     length_between,
     measured_board,
     measured_sphere,
     plain,
-    sphere_points,
     target_ends,
 )
 from scanner.capture import Capture
+from scanner.covariance import read_covariance
 from scanner.errors import DecodeError, ScannerError
 from scanner.geometry import Calibration, load_calibration
 from scanner.scan import Scan
@@ -158,6 +159,12 @@ def _warnings(found: dict[str, Any]) -> list[str]:
             "times the usual, and are in none of its figures: form and size are no PF and PS of VDI/VDE 2634-2, which "
             "leaves three points in a thousand out. Wrong fringes or stripes do this, or something before the ball"
         )
+    if "sphere" in found and found["sphere"]["another_mm"] is not None:
+        warnings.append(
+            f"there is another ball in the scan, of {found['sphere']['another_mm']:.2f} mm: the figures are of the one "
+            f"of {found['sphere']['diameter_mm']:.2f} mm, which is nearer to what was stated. To measure the other, "
+            "keep this one out (fringed decode --box)"
+        )
     return warnings
 
 
@@ -177,6 +184,10 @@ def rig_of(folder: Path, scan: Scan, given: Path | None = None) -> tuple[Rig | N
     if calibration.extra.get("covariance") is None:
         simulated = calibration.id.startswith(SIMULATED)
         return rig, f"the calibration has no covariance{' (the true one of a simulated rig)' if simulated else ''}"
+    try:
+        read_covariance(calibration.extra["covariance"])
+    except ValueError as error:
+        return rig, f"the calibration's covariance cannot be read: {error}"
     return rig, None
 
 

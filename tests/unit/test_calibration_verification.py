@@ -113,6 +113,25 @@ def test_small_sphere_before_a_wide_wall() -> None:
     assert found.size_mm == pytest.approx(0.0, abs=0.02)
 
 
+@pytest.mark.parametrize(("stated", "other"), [(50.0, 48.0), (48.0, 50.0)])
+def test_of_two_balls_the_one_that_was_stated_is_measured_and_the_other_named(stated: float, other: float) -> None:
+    # One beside the other, and farther away than its wall.
+    both = np.concatenate((ball(noise_mm=0.03), ball(24.0, noise_mm=0.03) + np.array([85.0, 0.0, 0.0])), axis=1)
+    found = sphere(both, stated)
+    assert found.diameter_mm == pytest.approx(stated, abs=0.02)
+    assert found.another_mm == pytest.approx(other, abs=0.02)
+    assert sphere(ball(noise_mm=0.03), 50.0).another_mm is None
+
+
+def test_a_slice_of_a_ball_is_no_ball_of_metres() -> None:
+    # 2 mm of a ball of 50 stand out of a wall.
+    shallow = ball(noise_mm=0.03)
+    shallow[..., 2] = np.minimum(shallow[..., 2], 377.0)
+    with pytest.raises(DecodeError) as refused:
+        sphere(shallow, 200.0)
+    assert not re.search(r"there is one of \d{4}", str(refused.value))
+
+
 def test_sphere_of_another_size_is_not_found() -> None:
     with pytest.raises(DecodeError, match="no sphere"):
         sphere(board()[::2, ::2], 20.0)

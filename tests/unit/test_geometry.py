@@ -104,6 +104,8 @@ def test_a_calibration_without_an_id_is_named_by_its_contents(rig_of, tmp_path, 
         (lambda c: c["rotation"][0].__setitem__(0, -c["rotation"][0][0]), "not a rotation"),
         (lambda c: c.update(translation=[0, 0, 0]), "translation is zero"),
         (lambda c: c.update(translation=["a", 0, 0]), "not an array of numbers"),
+        (lambda c: c["camera"]["distortion"].__setitem__(0, "0.1"), "not an array of numbers"),
+        (lambda c: c["camera"]["distortion"].__setitem__(0, True), "not an array of numbers"),
         (lambda c: c.update(translation=[10**400, 0, 0]), "not an array of numbers"),
         (lambda c: c.update(units="m"), "units"),
         (lambda c: c["camera"].update(distortion=[1e9] * 5), "folds the image"),
@@ -128,5 +130,13 @@ def test_an_unreadable_calibration_file_is_named(tmp_path):
     with pytest.raises(CalibrationError, match="cannot read"):
         load_calibration(tmp_path / "none.json")
     (tmp_path / "text.json").write_text("no json")
-    with pytest.raises(CalibrationError, match="not JSON"):
+    with pytest.raises(CalibrationError, match="as JSON"):
         load_calibration(tmp_path / "text.json")
+
+
+def test_a_member_that_is_there_twice_is_refused(rig_of, tmp_path):
+    text = json.dumps(rig_of("y").as_dict())
+    path = tmp_path / "edited.json"
+    path.write_text(text[:-1] + ', "translation": [0, 0, 1]}')
+    with pytest.raises(CalibrationError, match="'translation' is there twice"):
+        load_calibration(path)
