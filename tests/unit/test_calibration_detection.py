@@ -233,7 +233,7 @@ def test_target_files_that_are_none(tmp_path: Path) -> None:
     file = tmp_path / "wedge.json"
     on_a_curve = [[20 * k, k * k, 0] for k in range(12)]
     for content, words in (
-        ("{", "not JSON"),
+        ("{", "as JSON"),
         ('{"format": "x"}', "no fringed-target"),
         ('{"format": "fringed-target", "version": 1, "points": [[1, 2, 3]], "diameter_mm": 5}', "needs 12"),
         ('{"format": "fringed-target", "version": 1, "points": [[1, 2]]}', "list of"),

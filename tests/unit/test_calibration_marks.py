@@ -200,7 +200,7 @@ def test_files_are_read_back_and_bad_ones_refused(marks: Marks, tmp_path: Path) 
     with pytest.raises(CalibrationError, match="cannot read"):
         load_marks(tmp_path / "none.json")
     file.write_text("{")
-    with pytest.raises(CalibrationError, match="not JSON"):
+    with pytest.raises(CalibrationError, match="as JSON"):
         load_marks(file)
 
 
