@@ -6,6 +6,8 @@ It judges a decoded capture and warns; it chooses no exposure (that is `scanner.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,9 +76,14 @@ def clips_below(capture: Capture) -> tuple[str, ...]:
     present = [p for p in header.sequence.fringes if p in capture.records]
     if not isinstance(header.sequence.pattern, PmpPattern) or not present:
         return ()
-    counts, every, last = np.zeros(header.camera.max_value + 1, np.int64), 2 * _EVERY, header.camera.max_value
-    for p in present:
-        counts += np.bincount(capture.frame(p)[::every, ::every].reshape(-1), minlength=last + 1)[: last + 1]
+    return cut_off((capture.frame(p) for p in present), header.camera.max_value)
+
+
+def cut_off(frames: Iterable[NDArray[Any]], last: int) -> tuple[str, ...]:
+    """The same of fringes' frames, (H, W) each. last: the camera's largest grey level."""
+    counts, every = np.zeros(last + 1, np.int64), 2 * _EVERY
+    for frame in frames:
+        counts += np.bincount(frame[::every, ::every].reshape(-1), minlength=last + 1)[: last + 1]
     top = int(np.flatnonzero(counts)[-1]) if counts.any() else 0
     if top >= CLIP * last:
         return ()

@@ -23,6 +23,8 @@ def checked(found: Response, levels: LevelResponse | None) -> tuple[dict[str, An
     Returns:
         `response.projector` of a calibration file where only fringes tell it, else None; and the lines to say.
     """
+    if found.warnings:
+        return None, tuple(f"response by the target's fringes, a check: {said}" for said in found.warnings)
     unsure = found.expanded
     seen = (
         f"response by the target's fringes, a check: light follows what is projected to the power of "

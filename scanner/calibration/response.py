@@ -11,7 +11,7 @@ part of decoding.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -23,6 +23,7 @@ from scanner.decode import decoder_for
 from scanner.errors import CalibrationError
 from scanner.patterns import CameraFormat, PatternSequence, PmpPattern
 from scanner.patterns.pmp import AMPLITUDE, MEAN, FringeSet
+from scanner.saturation import cut_off
 
 PIXELS = 1000
 """Decided pixels that are looked at: an exponent is good to .01 with 8-bit frames."""
@@ -50,6 +51,14 @@ OVERTONES = 9
 MOST_BLUR2 = 4.0
 """Squared 1-sigma of blur, in radians of the finest fringe: of that fringe itself an eighth is left then"""
 
+PHASES = 32
+"""Of a fringe, at which residuals of all pixels are compared"""
+
+NO_POWER = 0.0015
+"""Share of the fringes' height that all pixels may leave alike: sound captures of the simulated rigs left .1 % at the
+most, plain boards .05 %; eight shifts cut off at four fifths of the range .2 to .7 %, a bent table .7 to 1.5 %. Three
+shifts show a third of that: the fringe itself takes the rest."""
+
 _STEPS = 3
 _TINY = 1e-9
 
@@ -72,6 +81,23 @@ class Response:
     pixels: int
     blurred: bool = False
     """blur may have drawn the exponent towards 1: one frequency cannot tell"""
+    unexplained: float = 0.0
+    """what all pixels leave alike at the same phase, rms, share of the fringes' height"""
+    cut_off: tuple[str, ...] = ()
+    """that the camera cuts fringes off, in words"""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why this exponent may not be the light's."""
+        if self.unexplained <= NO_POWER:
+            return self.cut_off
+        return (
+            *self.cut_off,
+            f"no exponent explains these fringes: {self.unexplained:.2%} of their height are left alike at all pixels "
+            "(noise leaves less than 0.1 %), as where light follows a table, or bright light is cut off. The exponent "
+            "may be off by more than is said: measure grey levels (fringed calibrate response RIG.toml), which tell "
+            "any response",
+        )
 
     @property
     def expanded(self) -> float:
@@ -81,7 +107,7 @@ class Response:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data."""
-        return {**asdict(self), "expanded": self.expanded}
+        return {**asdict(self), "expanded": self.expanded, "warnings": self.warnings}
 
 
 def response_of_frames(
@@ -127,7 +153,7 @@ def response_of_frames(
         [frames[sequence.fringes[s.first + n]].reshape(-1)[chosen] for s in sets for n in range(s.shifts)], axis=1
     ).astype(np.float64)
     problem = _Problem(grey, coordinate.reshape(-1)[chosen].astype(np.float64), _angles(pattern, sets, sequence), sets)
-    return _solve(problem, sequence)
+    return replace(_solve(problem, sequence), cut_off=cut_off(frames, camera.max_value))
 
 
 def _solve(problem: _Problem, sequence: PatternSequence) -> Response:
@@ -149,6 +175,7 @@ def _solve(problem: _Problem, sequence: PatternSequence) -> Response:
     return Response(
         exponent, sigma, None if prior is None else prior * exponent, ripple,
         float(np.sqrt(before * share)), float(np.sqrt(here * share)), len(problem.grey), not problem.tells_blur,
+        problem.unexplained(exponent, blur2),
     )  # fmt: skip
 
 
@@ -223,6 +250,23 @@ class _Problem:
 
     def misfit(self, exponent: float, blur2: float = 0.0) -> tuple[float, NDArray[np.float64]]:
         """(sum of squared residuals over squared fringe height, of the pixels that fit best; coordinates (n,))."""
+        left, y = self._left(exponent, blur2)
+        return float(np.sort((left**2).sum(axis=1))[: self.kept].sum()), y
+
+    def unexplained(self, exponent: float, blur2: float) -> float:
+        """Share of the fringes' height that all pixels leave alike at the same phase, rms over the phases: what light
+        does that is no power. Noise, which they do not share, is taken off."""
+        left, y = self._left(exponent, blur2)
+        best = np.argsort((left**2).sum(axis=1))[: self.kept]
+        turns = ((y[best, None] * self._rate + self._offset) / (2 * np.pi)) % 1
+        phase = np.minimum((turns * PHASES).astype(np.intp), PHASES - 1).ravel()
+        each = np.maximum(np.bincount(phase, minlength=PHASES), 1)
+        mean = np.bincount(phase, left[best].ravel(), PHASES) / each
+        noise = np.maximum(np.bincount(phase, left[best].ravel() ** 2, PHASES) / each - mean**2, 0) / each
+        return float(np.sqrt(max(float(np.mean(mean**2 - noise)), 0.0)))
+
+    def _left(self, exponent: float, blur2: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(n, F) residuals, share of the fringes' height, and (n,) coordinates that make them least."""
         y = self._start
         parameters = self._linear(y, exponent, blur2)
         for _ in range(_STEPS):
@@ -233,8 +277,8 @@ class _Problem:
             parameters = parameters + change[:, :-1]
             y = y + np.clip(change[:, -1], -5, 5)
         light, _ = self._light(y, exponent, blur2)
-        left = (self.grey - parameters[:, :1] - self._heights(parameters) * light) ** 2 / self._squared[:, None]
-        return float(np.sort(left.sum(axis=1))[: self.kept].sum()), y
+        left = self.grey - parameters[:, :1] - self._heights(parameters) * light
+        return left / np.sqrt(self._squared)[:, None], y
 
     def _heights(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, F) b of each frame's set."""

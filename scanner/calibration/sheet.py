@@ -6,7 +6,7 @@ with its uncertainty; where these contradict each other one of them is wrong, an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ print on, 3 to 5 mm a side: 3 to 5 % of an A4 page's width. Beyond, it is anothe
 between other points (one square of a row of 8 is 12 %), or another unit."""
 CONTRADICTED = 3.0
 """Combined sigmas of print and length from which they contradict each other: 0.3 % of honest pairs are as far apart"""
+_OTHER_GRID = "take one with more columns than rows, or ChArUco"
 EXACT = 1e-6
 """Sigma of a sheet's scale below which nothing is fitted: of glass, metal, and bodies in space"""
 
@@ -91,6 +92,47 @@ def stated_length(given: tuple[float, float] | None, target: Target) -> Length |
             f"{_fitting(target.spacing_mm, mm, sigma, nominal)} instead of {target.spacing_mm:g} would fit",
         )
     return Length(*target.longest, mm, max(sigma, 1e-6))
+
+
+def either_row(problem: Problem, state: State) -> Length | None:
+    """The stated length as it is known of a sheet that looks the same turned by a quarter: it was measured along a row
+    or along a column, nobody knows which, and the sheet is not stretched alike. None where that makes no difference."""
+    length = problem.length
+    if length is None or not problem.target.same_when_turned or is_exact(problem.priors):
+        return None
+    apart = float(abs(state.sheet[0] - state.sheet[1])) * problem.target.longest_mm
+    return replace(length, sigma_mm=float(np.hypot(length.sigma_mm, apart))) if apart > length.sigma_mm else None
+
+
+def turned_words(problem: Problem, state: State, *, either: bool, left_out: bool) -> list[str]:
+    """What to say of such a sheet. either: see `either_row`. left_out: some views contradict the others."""
+    if not problem.target.same_when_turned or is_exact(problem.priors):
+        return []
+    grid, advice = f"{_square(problem.target)} looks the same turned by a quarter", _OTHER_GRID
+    if either:
+        return [
+            f"{grid}, and this sheet is stretched by {abs(state.sheet[0] - state.sheet[1]):.2%} more one way than the "
+            "other: along which of them the length was measured no picture tells, and the scale is as unsure as that: "
+            f"{advice}"
+        ]
+    if left_out:
+        held = "views in which it was held another way up than in the others contradict these"
+        return [f"{grid}: {held}. Hold it one way, or {advice}"]
+    return []
+
+
+def measured_words(target: Target) -> list[str]:
+    """The same of a length that is measured between its ends."""
+    if not target.same_when_turned:
+        return []
+    return [
+        f"{_square(target)} looks the same turned by a quarter: whether the row that was measured is the one whose "
+        f"length was stated no picture tells. Hold it as it was measured, or {_OTHER_GRID}"
+    ]
+
+
+def _square(target: Target) -> str:
+    return f"a target of {target.columns} x {target.rows}"
 
 
 def contradiction(problem: Problem, state: State) -> Contradiction | None:

@@ -40,7 +40,7 @@ from scanner.calibration.problem import (
     State,
     View,
 )
-from scanner.calibration.sheet import contradiction, stated_length
+from scanner.calibration.sheet import contradiction, either_row, stated_length, turned_words
 from scanner.calibration.start import FEWEST_VIEWS
 from scanner.calibration.targets import Target
 from scanner.errors import CalibrationError
@@ -141,12 +141,16 @@ def solve(
         stated_length(options.length, target),
     )
     found = agreed(problem, leave_out=leave_out)
+    either = either_row(problem, found.adjusted.state)
+    if either is not None:
+        found = agreed(replace(problem, length=either), leave_out=leave_out)
     problem, adjusted = found.problem, found.adjusted
     out += found.left_out
     check_state(problem, adjusted)
     warnings = check_stated(problem, adjusted.state, options.baseline_mm, options.distance_mm)
     if found.split is not None:
         warnings.append(_split_words(found, found.split))
+    warnings += turned_words(problem, adjusted.state, either=either is not None, left_out=bool(found.left_out))
     held_out = found.held_out or HeldOut.nothing(adjusted)
     adjusted = replace(adjusted, covariance=held_out.covariance)
     used = {view.name for view in problem.views}

@@ -68,6 +68,11 @@ class Target:
         """Whether the points are centres of discs, which perspective moves."""
         return self.diameter_mm > 0
 
+    @property
+    def same_when_turned(self) -> bool:
+        """Whether a quarter turn makes it look the same, so that no picture tells its rows from its columns."""
+        return self.kind in ("chessboard", "circles") and self.columns == self.rows
+
     @cached_property
     def half_extent(self) -> tuple[float, float]:
         """Half width and height of the field of points, mm."""

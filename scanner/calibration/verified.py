@@ -28,6 +28,7 @@ from scanner.calibration.figure_spread import (
 )
 from scanner.calibration.markers import of_another_kind
 from scanner.calibration.marks import Marks, measured_marks
+from scanner.calibration.sheet import measured_words
 from scanner.calibration.targets import Target
 from scanner.calibration.verification import (
     LEFT_OUT,
@@ -111,7 +112,8 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
         found["coverage_factor"], found["unknown"] = COVERAGE_FACTOR, why
         another = None if wanted.target is None else of_another_kind(scan.albedo, wanted.target)
         kept = () if rig is None or given is not None else rig.calibration.warnings
-        found["warnings"] = [*_warnings(found), *filter(None, [another]), *kept]
+        turned = [] if wanted.target is None else measured_words(wanted.target)
+        found["warnings"] = [*_warnings(found), *filter(None, [another]), *turned, *kept]
         found["stated_length"] = None if rig is None or why is not None else _of_stated(found, rig)
     if wanted.edge is not None:
         x, y, width, height = wanted.edge

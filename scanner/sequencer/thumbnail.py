@@ -22,5 +22,6 @@ def stride_for(width: int) -> int:
 def thumbnail(frame: Pixels) -> Pixels:
     """A copy of every stride-th pixel in rows and columns, beginning in the stride's middle. (H, W) -> (h, w)."""
     stride = stride_for(frame.shape[1])
-    thinned: Pixels = np.ascontiguousarray(frame[stride // 2 :: stride, stride // 2 :: stride])  # type: ignore[assignment]
+    top, left = (min(stride // 2, (size - 1) // 2) for size in frame.shape)
+    thinned: Pixels = np.ascontiguousarray(frame[top::stride, left::stride])  # type: ignore[assignment]
     return thinned

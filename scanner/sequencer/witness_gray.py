@@ -7,7 +7,7 @@ another one must explain the frames markedly better. Which orders there are stan
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -281,6 +281,15 @@ def _smoothness(scene: Scene, code: _Code, orders: tuple[Order, ...], cannot: li
     scores = np.array([_roughness(code, order, triples) for order in orders])
     best, order = float(scores.min()), orders[int(scores.argmin())]
     name = f"code order {code.axis}"
+    other = replace(code, code="binary" if code.code == "gray" else "gray")
+    as_other = _roughness(other, _as_it_is(code), triples)
+    if as_other < ROUGHNESS_GAIN * min(here, best):
+        says = (
+            f"positions along {code.axis} are broken as {code.code} code and smooth as {other.code} code (roughness "
+            f'{here:.2f} and {as_other:.2f}): is "code": "{code.code}" of the description wrong?'
+        )
+        every = tuple(sorted(p for pair in code.positions for p in pair))
+        return [Witness(name, False, here, as_other / ROUGHNESS_GAIN, every, says, whole=True)]
     if best >= ROUGHNESS_GAIN * here:
         return [Witness(name, True, here, best / ROUGHNESS_GAIN, says="positions are smoothest in this order")]
     if np.mean((code.values(order, triples) >= code.cells).any(axis=1)) > MOST_BEYOND:
@@ -288,7 +297,7 @@ def _smoothness(scene: Scene, code: _Code, orders: tuple[Order, ...], cannot: li
         return []
     frames = _named(code, order)
     says = (
-        f"positions along {code.axis} are broken as they are and smooth with frames {listed(frames)} {order.says} "
+        f"positions along {code.axis} are broken as they are and smoother with frames {listed(frames)} {order.says} "
         f"(roughness {here:.2f} and {best:.2f})"
     )
     return [Witness(name, False, here, best / ROUGHNESS_GAIN, frames, says)]

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from scanner.digits import with_uncertainty
+from scanner.errors import CalibrationError
 from service.commands.options import AsJson
-from service.terminal import ProgressLines, print_facts, print_json, progress_lines
+from service.terminal import ProgressLines, print_error, print_facts, print_json, progress_lines
 
 if TYPE_CHECKING:
     from scanner.calibration.grey_levels import LevelResponse
@@ -60,13 +61,21 @@ def response(
             found = _of_rig(source, lines)
         else:
             found = _of_capture(Path(source), lines)
-    of_projector = _projector_response(found)
-    if write is not None:
+    of_projector, doubts = _projector_response(found), _warnings(found)
+    if write is not None and not doubts:
         _write(write, of_projector)
     if as_json:
         print_json({**found.as_dict(), "response": of_projector})
-        return 0
-    print_facts("response", [*_facts(found), ("where", _where(of_projector, write))])
+    else:
+        where = "nowhere: this exponent is doubtful" if doubts else _where(of_projector, write)
+        print_facts("response", [*_facts(found), ("where", where)])
+        for said in doubts:
+            print_error(said, label="warning")
+    if write is not None and doubts:
+        raise CalibrationError(
+            f"{write} was not changed: this exponent is doubtful, as the warnings say",
+            hint="measure grey levels: fringed calibrate response RIG.toml --write FILE",
+        )
     return 0
 
 
@@ -164,6 +173,12 @@ def _write(path: Path, of_projector: dict[str, Any] | None) -> None:
     content["id"] = content_id(content)
     calibration_from_dict(content, name=f"{path} with this response")
     replace_file(path, as_text(content).encode())
+
+
+def _warnings(found: LevelResponse | Response) -> tuple[str, ...]:
+    from scanner.calibration.response import Response  # noqa: PLC0415
+
+    return found.warnings if isinstance(found, Response) else ()
 
 
 def _facts(found: LevelResponse | Response) -> list[tuple[str, str]]:

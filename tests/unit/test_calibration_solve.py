@@ -143,6 +143,21 @@ def test_a_sheet_bent_in_any_way_is_found(shape: str) -> None:
     assert calibration_dict(found)["target"]["twist_mm"] == found.state.sheet[4]
 
 
+def test_of_a_square_grid_nobody_knows_which_row_was_measured() -> None:
+    square = parse_target("chessboard:7x7:30")
+    measured = 1.0015 * square.longest_mm  # along y; the pictures are read as if it had been x
+    seen = observations(RIG, poses(6), target=square, sheet=(1.0, 1.0015, 1.0))
+    found = calibrate(square, seen, SolveOptions(length=(measured, 0.02)))
+    off = np.abs(found.state.translation - RIG.translation) / sigmas(found.adjusted)["translation"]
+    assert off.max() < 2
+    (said,) = [warning for warning in found.warnings if "turned by a quarter" in warning]
+    assert re.search(r"stretched by 0\.1[4-6]% more one way than the other", said)
+    even = observations(RIG, poses(6), target=square, sheet=(1.0015, 1.0015, 1.0))
+    plain = calibrate(square, even, SolveOptions(length=(measured, 0.02)))
+    assert not any("turned by a quarter" in warning for warning in plain.warnings)
+    assert sigmas(plain.adjusted)["translation"].max() < 0.3 * sigmas(found.adjusted)["translation"].max()
+
+
 def test_scale_is_the_stated_length_or_unverified(solution: Solution, capsys: pytest.CaptureFixture[str]) -> None:
     plain = calibration_dict(calibrate(TARGET, observations(RIG, poses(6)), SolveOptions(rigid=True)))
     assert plain["scale"] == "unverified"

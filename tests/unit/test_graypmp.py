@@ -247,3 +247,9 @@ def test_code_frames_out_of_order_are_refused(axis, code, order):
     }[order]
     with pytest.raises(DecodeError, match=r"the Gray code (jumps at|names cells beyond).*not in the order described"):
         decode(sequence, frames | {to: frames[of] for to, of in zip(code, shown, strict=True)})
+
+
+def test_a_thumbnail_of_few_rows_has_some() -> None:
+    frame = np.arange(480, dtype=np.uint8)[None].repeat(1, axis=0)
+    assert thumbnail(frame).shape[0] == 1
+    assert thumbnail(frame.T).shape[1] == 1

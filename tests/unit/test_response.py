@@ -67,6 +67,19 @@ def test_one_frequency_cannot_tell_blur_and_says_so():
     assert found.exponent == pytest.approx(1.5, abs=found.expanded)
 
 
+def test_light_that_follows_no_power_is_said_to(tmp_path, capsys):
+    sequence = PatternSequence(PROJECTOR, PmpPattern(("y",), (1.0, 8.0, 24.0), (8, 8, 8)))
+    frames = shown(sequence, 1.3)
+    assert response_of_frames(sequence, CAMERA, frames).warnings == ()
+    cut = response_of_frames(sequence, CAMERA, [np.minimum(frame, 150) for frame in frames])
+    assert "are 150 of 255 and none is brighter" in cut.warnings[0]
+    assert "no exponent explains these fringes" in cut.warnings[1]
+    levels = np.arange(256) / 255
+    bent = np.rint(255 * (levels + 0.05 * np.sin(2 * np.pi * levels))).astype(np.uint8)
+    (said,) = response_of_frames(sequence, CAMERA, [bent[frame] for frame in frames]).warnings
+    assert "no exponent explains these fringes" in said
+
+
 def test_an_exponent_beyond_what_fringes_tell_is_refused():
     sequence = PatternSequence(PROJECTOR, PmpPattern(("y",), (1.0, 8.0), (8, 8)))
     with pytest.raises(CalibrationError, match="lies beyond"):

@@ -401,3 +401,14 @@ def test_a_lamp_that_drifts_does_not_pass_for_noise() -> None:
     assert steady is not None
     assert drifting is not None
     assert drifting.noise < 1.25 * steady.noise
+
+
+@pytest.mark.parametrize(("shown", "claimed"), [("gray", "binary"), ("binary", "gray")])
+def test_a_code_described_as_the_other_one_is_named(shown: str, claimed: str) -> None:
+    capture = take(PatternSequence.bracketed(QUICK, GrayPattern(("y",), 7, 8, shown, inverse=True)), scene="board")
+    frames = dict(enumerate(capture.thumbnails[p] for p in capture.sequence.fringes))
+    right, wrong = (PatternSequence(QUICK, GrayPattern(("y",), 7, 8, code, inverse=True)) for code in (shown, claimed))
+    assert witness(right, frames, 255).passed
+    found = witness(wrong, frames, 255)
+    assert not found.passed
+    assert f"smooth as {shown} code" in str(sync_error(wrong, (), found, ()))
