@@ -155,6 +155,16 @@ def check_response(response: Mapping[str, Any], name: str) -> None:
             raise CalibrationError(f"{where}.table must be 256 rising values of light, 0 .. 1")
 
 
+def response_warnings(response: Any, name: str) -> list[str]:
+    """What of a response nothing is made of."""
+    if not isinstance(response, dict) or not any((response.get("camera") or {}).values()):
+        return []
+    return [
+        f"{name}: response.camera is not applied: frames are decoded as they are, and a camera that is not linear "
+        "makes ripples. Set the camera's own gamma to 1, or make its images linear before they are decoded"
+    ]
+
+
 def _shift_warnings(lens: Lens, name: str) -> list[str]:
     middle = np.array([(n - 1) / 2 for n in lens.size])
     centre, focal = lens.matrix[:2, 2], np.array([lens.matrix[0, 0], lens.matrix[1, 1]])

@@ -19,7 +19,15 @@ from numpy.typing import NDArray
 from scanner.bounded_files import read_small_json
 from scanner.calibration_id import content_id, id_warnings
 from scanner.covariance import read_covariance, taken_as_exact
-from scanner.credible import check_hall, check_response, check_slope, lens_warnings, pixel_warnings, rig_warnings
+from scanner.credible import (
+    check_hall,
+    check_response,
+    check_slope,
+    lens_warnings,
+    pixel_warnings,
+    response_warnings,
+    rig_warnings,
+)
 from scanner.errors import CalibrationError
 from scanner.kernel import kernel
 
@@ -212,6 +220,7 @@ def calibration_from_dict(content: Any, name: str = "calibration") -> Calibratio
     # What has no name is named by what it says: a scan can always tell what it rests on.
     rig = Calibration(camera, projector, rotation, translation, id=identity or content_id(content), extra=extra)
     odd += [*rig_warnings(rig, name), *_covariance_warnings(content, name)]
+    odd += response_warnings(content.get("response"), name)
     return replace(rig, warnings=tuple(odd))
 
 

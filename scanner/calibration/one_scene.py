@@ -6,8 +6,8 @@ nothing in it says so: what differs by more than any noise is told apart here, b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -31,11 +31,41 @@ fifth too small one in a million"""
 
 @dataclass(frozen=True)
 class Repeat:
-    """One scan. xyz: (H, W, 3) mm; sigma_z: (H, W) mm, None where the scan has none."""
+    """One scan. xyz: (H, W, 3) mm; sigma_z: (H, W) mm, None where the scan has none; report: report.json's."""
 
     name: str
     xyz: NDArray[Any]
     sigma_z: NDArray[np.float32] | None
+    report: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def made(self) -> dict[str, str]:
+        """How, as far as its report tells: what scans that repeat each other have in common."""
+        capture, rig = (self.report.get(name) or {} for name in ("capture", "rig"))
+        frames = (capture.get("shows") or {}).get("fringe")
+        used = (capture.get("exposure") or {}).get("used_us")
+        places = ", ".join(f"{mm:.2f}" for mm in rig.get("projector_centre_mm") or ())
+        return {
+            "method": f"{(self.report.get('decoder') or {}).get('method')}, {frames} frames of the pattern",
+            "repetitions": f"{capture.get('repeat')} in one scan",
+            "exposure": f"{used} us",
+            "calibration": f"{rig.get('calibration')}, with the projector at {places} mm",
+        }
+
+
+def made_otherwise(scans: Sequence[Repeat]) -> list[str]:
+    """Words for what scans that are said to repeat each other were made differently by."""
+    found = []
+    for what in scans[0].made if scans else ():
+        ways: dict[str, list[str]] = {}
+        for scan in scans:
+            ways.setdefault(scan.made[what], []).append(scan.name)
+        if len(ways) > 1:
+            listed = "; ".join(f"{way} ({', '.join(names)})" for way, names in ways.items())
+            found.append(
+                f"the scans were not made alike: {what} {listed}. Their deviation is no repeatability of either"
+            )
+    return found
 
 
 def require_one_scene(scans: Sequence[Repeat]) -> list[str]:

@@ -120,7 +120,7 @@ def verify(
             results.append({"scan": str(folder), "systematic_mm": budget.get("systematic_mm"), **measured})
             results[-1]["systematic_besides"] = _besides(budget, measured)
             if repeat and scan.xyz is not None:
-                repeats.append(Repeat(str(folder), scan.xyz, scan.sigma_z))
+                repeats.append(Repeat(str(folder), scan.xyz, scan.sigma_z, scan.report))
             lines.advance(number + 1, len(scans))
         document: dict[str, Any] = {"scans": results}
         if repeat:
@@ -205,10 +205,10 @@ def _of_other_captures(one: Path, other: Path) -> bool:
 
 def _repeatability(scans: list[Repeat]) -> dict[str, Any]:
     """The document's, its uncertainty where the others have theirs."""
-    from scanner.calibration.one_scene import require_one_scene  # noqa: PLC0415
+    from scanner.calibration.one_scene import made_otherwise, require_one_scene  # noqa: PLC0415
     from scanner.calibration.verification import plain, repeatability  # noqa: PLC0415
 
-    warnings = require_one_scene(scans)
+    warnings = made_otherwise(scans) + require_one_scene(scans)
     found = plain(repeatability([one.xyz for one in scans]))
     expanded = found.pop("expanded_mm")
     standard = None if expanded is None else expanded / 2

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from scanner.calibration import figure_spread
-from scanner.calibration.one_scene import Repeat, require_one_scene
+from scanner.calibration.one_scene import Repeat, made_otherwise, require_one_scene
 from scanner.calibration.targets import parse_target
 from scanner.calibration.verification import flat_board, local_point, repeatability, sphere, target_length
 from scanner.calibration.verified import Wanted, verified
@@ -440,3 +440,16 @@ def test_marks_are_kept_and_verified(tmp_path: Path, capsys: pytest.CaptureFixtu
     shown = capsys.readouterr().out
     assert "plate offset mm" in shown
     assert "seen" not in shown
+
+
+def test_scans_that_were_made_otherwise_are_named() -> None:
+    def scan(name: str, method: str = "pmp", calibration: str = "a") -> Repeat:
+        report = {"decoder": {"method": method}, "capture": {"repeat": 1}, "rig": {"calibration": calibration}}
+        return Repeat(name, board(0.02), None, report)
+
+    assert made_otherwise([scan("s1"), scan("s2")]) == []
+    (said,) = made_otherwise([scan("s1"), scan("s2", "gray"), scan("s3")])
+    assert "method pmp" in said
+    assert "(s1, s3); gray" in said
+    (said,) = made_otherwise([scan("s1"), scan("s2", calibration="b")])
+    assert "calibration a" in said

@@ -109,6 +109,7 @@ ODD = [
     (lambda c: focal(c, "camera", 1.2 * 620.0, 620.0), "pixels that are not square"),
     (lambda c: focal(c, "camera", 620.0, 0.7 * 620.0), "pixels that are not square"),
     (lambda c: shifted(c, 3.5), "outside the picture"),
+    (lambda c: c.update(response={"projector": None, "camera": {"gamma": 2.2}}), "response.camera is not applied"),
     (lambda c: c["camera"].update(distortion=[-1.76, 0, 0, 0, 0]), "in its corners"),
 ]  # fmt: skip
 
