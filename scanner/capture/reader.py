@@ -50,6 +50,7 @@ class Capture:
         self.header = header
         self.all_records = tuple(records or ())
         self._colours: dict[bool, str] = {}  # an image file by whether it is in colour
+        self._full = 0.0  # largest share of a colour image's pixels that have a saturated channel
         self._slots = None if header.frames is not None else _map_frames(path, header)
         self._records = self._present(records, checked or {})
 
@@ -158,7 +159,14 @@ class Capture:
         """What the frames that were read are not, and need not be, but had better be."""
         if True not in self._colours:
             return ()
-        return (f"the frames are colour images ({self._colours[True]}): read as luma, grey ones measure better",)
+        said = f"the frames are colour images ({self._colours[True]}): read as luma, grey ones measure better"
+        if self._full <= MOST_FULL:
+            return (said,)
+        return (
+            said,
+            f"in one of them {self._full:.0%} of the pixels have a saturated channel, and a luma that is not: light is "
+            "cut off there, and no pixel counts as saturated. Expose for less, until no channel is full",
+        )
 
     def frame(self, pattern: int) -> Pixels:
         """The frame of a pattern index: (height, width) uint8 or uint16, a read-only view where possible.
@@ -172,6 +180,9 @@ class Capture:
             name = self.header.frames[pattern]
             image = _read_image(_inside(self.path, name), self.header.camera)
             self._require_alike(name, colour=image.ndim == 3)
+            if image.ndim == 3:
+                full = image >= self.header.camera.max_value
+                self._full = max(self._full, float((full.any(axis=2) & ~full.all(axis=2)).mean()))
             return _grey(image, self.header.camera, str(self.path / name))
         if slot is None or self._slots is None:
             raise KeyError(pattern)
@@ -297,6 +308,9 @@ def _read_npy_header(path: Path) -> tuple[tuple[int, ...], np.dtype[Any], int]:
 
 _PIXEL_BYTES = 32
 """The most that an image file takes for a pixel: plain text PPM has three numbers of five digits, and has comments"""
+
+MOST_FULL = 0.01
+"""Share of a colour image's pixels that may have a saturated channel: glints"""
 
 _IMAGE_HEAD_BYTES = 4 << 20
 """... and before and after the pixels: colour profile, thumbnail, what a camera says of itself"""

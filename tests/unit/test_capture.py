@@ -223,6 +223,11 @@ def test_image_files_are_read_colour_as_luma(tmp_path: Path) -> None:
         np.testing.assert_array_equal(colour.frame(index), pixels)
     assert grey.warnings == ()
     assert len(colour.warnings) == 1
+    full = [in_colour(f) for f in frames]
+    full[1][..., 1] = 255
+    green = Capture.open(image_capture(tmp_path / "green", write_images(tmp_path / "green", full)))
+    assert [green.frame(index) for index in range(len(full))]
+    assert "100% of the pixels have a saturated channel" in green.warnings[1]
 
 
 @pytest.mark.parametrize("odd", [0, 1])
