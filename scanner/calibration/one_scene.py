@@ -43,12 +43,10 @@ class Repeat:
         """How, as far as its report tells: what scans that repeat each other have in common."""
         capture, rig = (self.report.get(name) or {} for name in ("capture", "rig"))
         frames = (capture.get("shows") or {}).get("fringe")
-        used = (capture.get("exposure") or {}).get("used_us")
         places = ", ".join(f"{mm:.2f}" for mm in rig.get("projector_centre_mm") or ())
         return {
             "method": f"{(self.report.get('decoder') or {}).get('method')}, {frames} frames of the pattern",
             "repetitions": f"{capture.get('repeat')} in one scan",
-            "exposure": f"{used} us",
             "calibration": f"{rig.get('calibration')}, with the projector at {places} mm",
         }
 
