@@ -28,6 +28,8 @@ FEWEST_SHARE = 0.3
 """Of a ChArUco board's corners; a chessboard or grid is seen whole or not at all."""
 FEWEST_POINTS = 8
 """Of one view: a homography takes four, twice as many leave something to judge by."""
+OTHER_SHARE = 0.6
+"""Of the points stated, that a board of other counts must have: less is part of one, or of something else"""
 
 LEAST_SIDE_PX = 24
 """Of a picture: four squares a side with room for a corner's window."""
@@ -84,10 +86,25 @@ def _chessboard(picture: NDArray[np.float32], grey: NDArray[np.uint8], target: T
     else:
         found, corners = cv2.findChessboardCorners(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
     if not found:
-        return NotFound(f"no chessboard of {target.columns} x {target.rows} inner corners in the picture")
+        said = f"no chessboard of {target.columns} x {target.rows} inner corners in the picture"
+        return NotFound(said + _other_counts(grey, target))
     ids = np.arange(target.columns * target.rows)
     grid = corners.reshape(target.rows, target.columns, 2).astype(np.float64)
     return _measured(picture, target, ids, grid)
+
+
+def _other_counts(grey: NDArray[np.uint8], target: Target) -> str:
+    """What counts the board has that is there, in words; nothing where none of that size is. People count squares."""
+    found = [
+        cv2.findChessboardCornersSBWithMeta(grey, (3, 3), cv2.CALIB_CB_LARGER | more)
+        for more in (0, cv2.CALIB_CB_NORMALIZE_IMAGE)
+    ]
+    counts = [sorted(meta.shape) for seen, _, meta in found if seen]
+    rows, columns = max(counts, key=lambda sides: sides[0] * sides[1], default=(0, 0))
+    as_stated = {rows, columns} == {target.rows, target.columns}
+    if as_stated or rows * columns < OTHER_SHARE * target.columns * target.rows:
+        return ""
+    return f"; one of {columns} x {rows} is there (inner corners count, not squares)"
 
 
 def _charuco(picture: NDArray[np.float32], grey: NDArray[np.uint8], target: Target) -> Detection | NotFound:

@@ -12,6 +12,8 @@ from scanner.calibration.targets import Target
 
 DICTIONARIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL")
 """Each contains the smaller ones of its kind."""
+MARKERS = "; there are ArUco markers: is it a ChArUco board (charuco:)?"
+"""Of a picture in which no target without markers is found"""
 FEWEST = 4
 """Markers of one kind: a square of a scene, or a speck in one, passes for one now and then"""
 

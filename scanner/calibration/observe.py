@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from scanner.calibration.copies import again, capture_key
 from scanner.calibration.detection import FEWEST_POINTS, NotFound, detect
-from scanner.calibration.markers import of_another_kind
+from scanner.calibration.markers import MARKERS, markers_in, of_another_kind
 from scanner.calibration.problem import View
 from scanner.calibration.projector_points import LEAST_REACH_PX, projector_points
 from scanner.calibration.targets import Target
@@ -150,7 +150,8 @@ def observe_capture(path: Path, name: str, target: Target, *, doubt_kind: bool =
         return LeftOut(name, said.replace(f"{path}/", ""), unreadable=True)
     view = observe_decoded(name, decoded, target, white=white, mosaic=capture.header.camera.mosaic is not None)
     if isinstance(view, LeftOut):
-        return view
+        charuco = doubt_kind and target.kind in ("chessboard", "circles", "acircles") and markers_in(decoded.albedo) > 0
+        return replace(view, reason=view.reason + MARKERS) if charuco else view
     camera, projector = capture.header.camera, sequence.projector
     other_kind = of_another_kind(decoded.albedo, target) if doubt_kind else None
     correction = sequence.precorrection

@@ -82,6 +82,13 @@ def test_what_is_not_there_is_said() -> None:
     assert "black" in black.reason
 
 
+@pytest.mark.parametrize("stated", ["chessboard:8x6:25", "chessboard:10x7:25"])
+def test_a_chessboard_of_other_counts_is_named_with_its_own(stated: str) -> None:
+    found = detect(drawn(parse_target("chessboard:9x6:25")), parse_target(stated))
+    assert isinstance(found, NotFound)
+    assert found.reason.endswith("; one of 9 x 6 is there (inner corners count, not squares)")
+
+
 def test_a_charuco_board_of_other_counts_is_doubted_by_its_markers() -> None:
     found = detect(drawn(parse_target("charuco:8x6:28")), parse_target("charuco:6x8:28"))
     assert isinstance(found, NotFound)

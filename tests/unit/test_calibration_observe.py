@@ -352,3 +352,5 @@ def test_a_charuco_board_that_is_described_as_a_chessboard_is_warned_of_once(tmp
         assert found
         said = [one for one in warnings_of(found) if "this is a ChArUco board" in one]
         assert len(said) == warned
+    _, left_out = observe(captures, parse_target("circles:9x6:19"))
+    assert all(one.reason.endswith("is it a ChArUco board (charuco:)?") for one in left_out)
