@@ -53,6 +53,11 @@ class Observation:
     warnings: tuple[str, ...] = ()
 
 
+MOST_CLIPPED = 0.05
+"""Share of a target's pixels that may be saturated: glints"""
+EXPOSE_LESS = "expose for less (--exposure auto), lower the gain, or close the lens"
+
+
 @dataclass(frozen=True)
 class LeftOut:
     """A capture that could not be used."""
@@ -163,7 +168,7 @@ def observe_capture(path: Path, name: str, target: Target, *, doubt_kind: bool =
         capture.header.created,
         capture.header.extra.get("warm_up") or {},
         key,
-        (*filter(None, [other_kind, capture.lost]), *decoded.warnings),
+        (*filter(None, [other_kind, capture.lost, _overexposed(decoded, target, view)]), *decoded.warnings),
     )
 
 
@@ -224,8 +229,24 @@ def _why(decoded: Decoded, points: NDArray[Any]) -> str:
     causes = tally(decoded.reason[near])
     causes[Reason.VALUE] = 0
     if int(np.argmax(causes)) == Reason.CLIPPED:
-        return "it is overexposed: expose for less (--exposure auto), lower the gain, or close the lens"
+        return f"it is overexposed: {EXPOSE_LESS}"
     return "light the whole target with the projector, and expose until its white is bright"
+
+
+def _overexposed(decoded: Decoded, target: Target, view: View) -> str | None:
+    """What to say of a flat target of which a good part is saturated, though enough points are left to serve."""
+    if not target.flat:
+        return None
+    homography: Any = cv2.findHomography(target.points[view.ids, :2], view.camera)[0]
+    if homography is None:  # no view of a plane
+        return None
+    outline = cv2.convexHull(cv2.perspectiveTransform(target.points[:, None, :2], homography).astype(np.float32))
+    there = np.zeros(decoded.reason.shape, np.uint8)
+    cv2.fillConvexPoly(there, np.rint(outline).astype(np.int32), 1)
+    share = float(np.mean(decoded.reason[there > 0] == Reason.CLIPPED)) if there.any() else 0.0
+    if share < MOST_CLIPPED:
+        return None
+    return f"a part of the target is overexposed, and has no points: {EXPOSE_LESS}"
 
 
 def _finished(decoder: Decoder, capture: Capture) -> Decoded:

@@ -112,6 +112,20 @@ def test_a_white_frame_is_where_the_target_is_looked_for_first(poses: Path, tmp_
     assert found["missing"] == pytest.approx(plain.view.camera)
 
 
+def test_a_part_that_is_overexposed_is_named(poses: Path, tmp_path: Path) -> None:
+    capture = Capture.open(poses / "p04" / "capture")
+    frames = [capture.frame(k).astype(float) for k in range(len(capture.header.sequence))]
+    plain = observe_capture(poses / "p04" / "capture", "p04", TARGET)
+    assert isinstance(plain, Observation)
+    assert plain.warnings == ()
+    right = np.arange(frames[0].shape[1]) > np.quantile(plain.view.camera[:, 0], 0.7)
+    glare = [np.clip(frame * np.where(right, 1.6, 1.0), 0, 255) for frame in frames]
+    outcome = observe_capture(write_capture(tmp_path / "glare", "quick/board", frames=glare), "glare", TARGET)
+    assert isinstance(outcome, Observation)
+    assert len(outcome.view.ids) < len(plain.view.ids)
+    assert any("a part of the target is overexposed, and has no points" in said for said in outcome.warnings)
+
+
 def test_points_on_a_line_or_hardly_any_do_not_serve(poses: Path) -> None:
     """Of a board of which fringes reach one row, or a few points."""
     capture = Capture.open(poses / "p04" / "capture")
