@@ -42,6 +42,9 @@ PILED, NEXT, OVER_NEXT = 0.005, 20, 2.0
 """Share of the samples that lie at the brightest level of all, and how many times as many as in the twentieth below it:
 a cosine has twice as many there as here, and noise makes these fewer."""
 
+LEAST_TOP = 40
+"""Grey levels: of dimmer fringes the last level alone is as wide as the top of a cosine"""
+
 _EVERY, _BLOCK = 8, 4
 """Pixels from sample to sample, and samples each way that are counted together. Of one pixel's eight shifts a whole
 number is saturated; its neighbours' phases differ, and the mean is the share that the brightness makes."""
@@ -85,7 +88,7 @@ def cut_off(frames: Iterable[NDArray[Any]], last: int) -> tuple[str, ...]:
     for frame in frames:
         counts += np.bincount(frame[::every, ::every].reshape(-1), minlength=last + 1)[: last + 1]
     top = int(np.flatnonzero(counts)[-1]) if counts.any() else 0
-    if top >= CLIP * last:
+    if not LEAST_TOP <= top < CLIP * last:
         return ()
     share, below = counts[top] / counts.sum(), int(counts[top - max(top // NEXT, 1) : top].sum())
     if share < PILED or counts[top] < OVER_NEXT * below:

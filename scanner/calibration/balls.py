@@ -46,12 +46,7 @@ def sphere_points(xyz: NDArray[Any], diameter_mm: float | None = None) -> Featur
     found = _ball(points, diameter_mm)
     if found.count < FEWEST_POINTS or not found.round:
         raise _no_sphere(points, found.count if found.round else 0, diameter_mm)
-    rest = ~_within_outline(points, found, BESIDE)
-    another = _ball(points, diameter_mm, rest) if rest.sum() >= FEWEST_POINTS else None
-    if another is None or another.count < FEWEST_POINTS or not another.round:
-        another = None
-    elif diameter_mm is not None and abs(another.diameter_mm - diameter_mm) < abs(found.diameter_mm - diameter_mm):
-        found, another = another, found
+    found, another = (found, None) if diameter_mm is None else _nearer(points, found, diameter_mm)
     seen, used = _within_outline(points, found, OUTLINE), found.used
     return FeaturePoints(
         points[used], at[used], float(used.mean()), float((seen & ~used).sum() / max(seen.sum(), 1)),
@@ -93,6 +88,16 @@ def _ball(points: Array, diameter_mm: float | None, among: NDArray[np.bool_] | N
     if among is not None:
         used = np.isin(np.arange(len(points)), np.flatnonzero(among)[used])
     return _Ball(used, centre, radius, rms)
+
+
+def _nearer(points: Array, found: _Ball, diameter_mm: float) -> tuple[_Ball, _Ball | None]:
+    """Of this ball and another one, clear of its outline, the one whose diameter is nearer; and the other, if any."""
+    rest = ~_within_outline(points, found, BESIDE)
+    another = _ball(points, diameter_mm, rest) if rest.sum() >= FEWEST_POINTS else None
+    if another is None or another.count < FEWEST_POINTS or not another.round:
+        return found, None
+    swapped = abs(another.diameter_mm - diameter_mm) < abs(found.diameter_mm - diameter_mm)
+    return (another, found) if swapped else (found, another)
 
 
 def _within_outline(points: Array, ball: _Ball, share: float) -> NDArray[np.bool_]:

@@ -35,6 +35,9 @@ MOST_NAMED = 4
 """Captures with one fault that are named; the others are counted."""
 FLATTEST = 0.02
 """Width over length of a view's points on the target, below which they lie on a line."""
+MOST_CLIPPED = 0.05
+"""Share of a target's pixels that may be saturated: glints"""
+EXPOSE_LESS = "expose for less (--exposure auto), lower the gain, or close the lens"
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +54,6 @@ class Observation:
     warm_up: Mapping[str, Any] = field(default_factory=dict)
     key: Hashable = None
     warnings: tuple[str, ...] = ()
-
-
-MOST_CLIPPED = 0.05
-"""Share of a target's pixels that may be saturated: glints"""
-EXPOSE_LESS = "expose for less (--exposure auto), lower the gain, or close the lens"
 
 
 @dataclass(frozen=True)

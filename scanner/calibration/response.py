@@ -107,7 +107,8 @@ class Response:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data."""
-        return {**asdict(self), "expanded": self.expanded, "warnings": self.warnings}
+        plain = {name: value for name, value in asdict(self).items() if name != "cut_off"}
+        return {**plain, "expanded": self.expanded, "warnings": list(self.warnings)}
 
 
 def response_of_frames(
