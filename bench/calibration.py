@@ -36,6 +36,7 @@ from drivers.registry import open_camera, open_projector
 from drivers.simulated.rigs import reference
 from drivers.simulated.rigs import rig as simulated_rig
 from drivers.simulated.targets import wedge_planes, wedge_points
+from scanner.calibration.balls import sphere_points
 from scanner.calibration.beyond_noise import beyond_noise
 from scanner.calibration.figure_spread import SPHERE
 from scanner.calibration.hall import triangulate_hall
@@ -45,7 +46,7 @@ from scanner.calibration.problem import View
 from scanner.calibration.solve import SolveOptions, sigmas, solve
 from scanner.calibration.solve_hall import solve_hall
 from scanner.calibration.targets import parse_target
-from scanner.calibration.verification import measured_sphere, sphere_points
+from scanner.calibration.verification import measured_sphere
 from scanner.clock import VirtualClock
 from scanner.decode import decoder_for
 from scanner.devices import CameraSettings, TriggerMode
