@@ -33,6 +33,8 @@ from scanner.errors import DecodeError
 
 WILD = 100.0
 """Times the others' variance that no noise has: of three scans, chi-square with two freedoms, one pixel in e^100"""
+PRINT_STEP, PRINT_CONTRAST = 2, 0.2
+"""Pixels over which print changes what a board reflects, and by how much of it at least"""
 LEFT_OUT = 0.003
 """Share of points that may be left out (VDI/VDE 2634-2, 2012, sec. 6)."""
 OF_SHELL = 0.05
@@ -145,6 +147,20 @@ def plane_of(xyz: NDArray[Any]) -> tuple[Array, Array]:
     """
     centre, normal, _ = plane_through(board_points(xyz).points)
     return centre, -np.sign(normal @ centre) * normal
+
+
+def at_print(albedo: NDArray[Any], on: FeaturePoints) -> float:
+    """Share of a feature's points that lie at an edge of brightness, as of print: blur mixes both sides there, and the
+    phases of both. albedo: (H, W) of the scan."""
+    level, there = np.asarray(albedo, np.float64), np.zeros(albedo.shape, bool)
+    there.reshape(-1)[on.at] = True
+    edges = points = 0
+    for first, second in ((np.s_[PRINT_STEP:], np.s_[:-PRINT_STEP]), (np.s_[:, PRINT_STEP:], np.s_[:, :-PRINT_STEP])):
+        both = there[first] & there[second]
+        one, other = level[first][both], level[second][both]
+        edges += int(np.count_nonzero(np.abs(one - other) > PRINT_CONTRAST * np.maximum(one, other)))
+        points += one.size
+    return edges / max(points, 1)
 
 
 def sphere(xyz: NDArray[Any], diameter_mm: float | None = None) -> Probing:

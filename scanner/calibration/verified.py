@@ -32,6 +32,7 @@ from scanner.calibration.sheet import measured_words
 from scanner.calibration.targets import Target
 from scanner.calibration.verification import (
     LEFT_OUT,
+    at_print,
     board_points,
     length_between,
     measured_board,
@@ -53,6 +54,12 @@ SAME_PX = 0.05
 calibration: float32 leaves a thousandth. Points of both axes lie between the two: noise, as it is stated, comes on
 top."""
 
+PRINTED = 0.01
+"""Share of a board's points at edges of brightness: plain boards have .1 % at the most, prints 2 % and more"""
+ON_PRINT = (
+    "the board is printed or stained: points at edges of brightness are off by what blur mixes there, and the flatness "
+    "holds that beside what the rig does. A plain matt board tells the rig's own"
+)
 FEW_USED = 0.9
 """Share of a scan's points that features explain, below which a board's figures may be of a part of it: of a plain
 board that fills the scan it is 99.9 %"""
@@ -91,12 +98,14 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
     if scan.xyz is None:
         raise DecodeError(f"{folder} has no points", hint="decode it with a calibration: fringed decode --calibration")
     found: dict[str, Any] = {}
+    said: list[str] = []
     rig, why = rig_of(folder, scan, given)
     if wanted.edge is not None:
         _require_within(wanted.edge, scan)
     if wanted.flat:
         board = board_points(scan.xyz)
         found["flat"] = _with_noise(plain(measured_board(board)), board, scan, BOARD, rig)
+        said += [ON_PRINT] if at_print(scan.albedo, board) > PRINTED else []
     if wanted.sphere_mm is not None:
         ball = sphere_points(scan.xyz, wanted.sphere_mm)
         found["sphere"] = _with_noise(plain(measured_sphere(ball, wanted.sphere_mm)), ball, scan, SPHERE, rig)
@@ -104,16 +113,15 @@ def verified(folder: Path, scan: Scan, wanted: Wanted, given: Path | None = None
         of_ball["size_mm"] = _of_error(of_ball["diameter_mm"], wanted.sphere_sigma_mm)
     if wanted.target is not None:
         seen, ends = target_ends(scan.albedo, scan.xyz, wanted.target)
+        said += [*filter(None, [of_another_kind(scan.albedo, wanted.target)]), *measured_words(wanted.target)]
         of_length = spread_of_length(seen, wanted.target, scan.xyz, rig).as_dict()
         found["length"] = plain(length_between(ends, wanted.target, wanted.length_mm))
         of_error = _of_error(of_length, wanted.length_sigma_mm)
         found["length"]["uncertainty"] = {"error_mm": of_error, "measured_mm": of_length}
     if found:
         found["coverage_factor"], found["unknown"] = COVERAGE_FACTOR, why
-        another = None if wanted.target is None else of_another_kind(scan.albedo, wanted.target)
         kept = () if rig is None or given is not None else rig.calibration.warnings
-        turned = [] if wanted.target is None else measured_words(wanted.target)
-        found["warnings"] = [*_warnings(found), *filter(None, [another]), *turned, *kept]
+        found["warnings"] = [*_warnings(found), *said, *kept]
         found["stated_length"] = None if rig is None or why is not None else _of_stated(found, rig)
     if wanted.edge is not None:
         x, y, width, height = wanted.edge

@@ -453,3 +453,12 @@ def test_scans_that_were_made_otherwise_are_named() -> None:
     assert "(s1, s3); gray" in said
     (said,) = made_otherwise([scan("s1"), scan("s2", calibration="b")])
     assert "calibration a" in said
+
+
+def test_a_board_that_is_printed_is_said_to_be(tmp_path: Path) -> None:
+    folder = save(tmp_path / "scan", board(0.02))
+    plain = load_scan(folder)
+    stripes = np.where(np.indices(plain.shape).sum(axis=0) % 24 < 12, np.float32(0.2), np.float32(1.0))
+    for scan, said in ((plain, False), (replace(plain, albedo=stripes), True)):
+        warnings = verified(folder, scan, Wanted(flat=True))["warnings"]
+        assert any("the board is printed" in warning for warning in warnings) == said
