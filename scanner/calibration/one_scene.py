@@ -41,11 +41,11 @@ class Repeat:
     @property
     def made(self) -> dict[str, str]:
         """How, as far as its report tells: what scans that repeat each other have in common."""
-        capture, rig = (self.report.get(name) or {} for name in ("capture", "rig"))
+        capture, decoder, rig = (self.report.get(name) or {} for name in ("capture", "decoder", "rig"))
         frames = (capture.get("shows") or {}).get("fringe")
         places = ", ".join(f"{mm:.2f}" for mm in rig.get("projector_centre_mm") or ())
         return {
-            "method": f"{(self.report.get('decoder') or {}).get('method')}, {frames} frames of the pattern",
+            "method": f"{capture.get('method') or decoder.get('method')}, {frames} frames of the pattern",
             "repetitions": f"{capture.get('repeat')} in one scan",
             "calibration": f"{rig.get('calibration')}, with the projector at {places} mm",
         }

@@ -191,6 +191,8 @@ def rig_of(folder: Path, scan: Scan, given: Path | None = None) -> tuple[Rig | N
     rig = Rig(calibration, axis or ("y" if scan.rows is not None else "x"))
     if not _made_by(rig, scan):
         return None, f"the scan's points were not made by calibration {calibration.id or given} as it stands"
+    if _method(scan) not in (*BY_PIXEL, None):
+        return None, "points of one stripe or cell err together, on slopes most, and by how much is not known"
     if calibration.extra.get("covariance") is None:
         simulated = calibration.id.startswith(SIMULATED)
         return rig, f"the calibration has no covariance{' (the true one of a simulated rig)' if simulated else ''}"
@@ -199,6 +201,12 @@ def rig_of(folder: Path, scan: Scan, given: Path | None = None) -> tuple[Rig | N
     except ValueError as error:
         return rig, f"the calibration's covariance cannot be read: {error}"
     return rig, None
+
+
+def _method(scan: Scan) -> str | None:
+    """That decoded it, as far as its report tells."""
+    decoder, capture = (scan.report.get(part) or {} for part in ("decoder", "capture"))
+    return decoder.get("method") or capture.get("method")
 
 
 def _kept(folder: Path, scan: Scan) -> Calibration | None:
@@ -240,13 +248,12 @@ def _with_noise(
     """The figures with their uncertainties; and of widths what a perfect feature has by noise, and what is beyond."""
     spreads = spread_of_figures(on, scan.shape[1], feature, rig)
     found = {**figures, "uncertainty": {name: spread.as_dict() for name, spread in spreads.items()}, "beyond": {}}
-    by_pixel = (scan.report.get("decoder") or {}).get("method") in BY_PIXEL
     deviations = feature.deviations(on.points)
     # A point moves along its ray: by as much of that as goes along the normal.
     across = (on.points / on.points[:, 2:] * deviations.normals).sum(axis=1)
     ripple = _rippled(scan) * float(np.sqrt(np.mean(across**2)))
     for name, left_out in feature.widths.items():
-        told = beyond_noise(deviations.off, on.at, scan.shape, left_out, ripple) if by_pixel else None
+        told = beyond_noise(deviations.off, on.at, scan.shape, left_out, ripple) if _method(scan) in BY_PIXEL else None
         found[NOISE_OF[name]] = None if told is None else told.noise_mm
         if told is None:
             continue

@@ -75,6 +75,24 @@ def test_a_calibration_that_was_edited_makes_no_points_anew(tmp_path: Path, caps
         assert ("edited by hand" in shown) == ("covariance" in changes)
 
 
+@pytest.mark.parametrize(("method", "known"), [("pmp", True), ("mcp", False), ("gray", False)])
+def test_points_that_err_together_have_no_uncertainty(
+    method: str, known: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = rig()
+    content["id"] = content_id(content)
+    save_of_rig(tmp_path / "a", *ball_of_rig(), content["id"])
+    (tmp_path / "a" / "capture" / "calibration.json").write_text(json.dumps(content))
+    report = tmp_path / "a" / "report.json"
+    made = {"decoder": {}, "capture": {"method": method}}
+    report.write_text(json.dumps({**json.loads(report.read_text()), **made}))
+    assert main(["calibrate", "verify", str(tmp_path / "a"), "--sphere", "120", "--json"]) == 0
+    one = json.loads(capsys.readouterr().out)["scans"][0]
+    assert (one["sphere"]["uncertainty"]["diameter_mm"]["expanded"] is not None) == known
+    assert (one["unknown"] is None) == known
+    assert known or "err together" in one["unknown"]
+
+
 def test_an_error_is_no_surer_than_what_it_is_measured_against(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
