@@ -43,7 +43,8 @@ class Repeat:
         """How, as far as its report tells: what scans that repeat each other have in common."""
         capture, decoder, rig = (self.report.get(name) or {} for name in ("capture", "decoder", "rig"))
         frames = (capture.get("shows") or {}).get("fringe")
-        places = ", ".join(f"{mm:.2f}" for mm in rig.get("projector_centre_mm") or ())
+        centre = rig.get("projector_centre_mm") or ()
+        places = ", ".join(f"{mm:.2f}" for mm in centre if isinstance(mm, int | float))
         return {
             "method": f"{capture.get('method') or decoder.get('method')}, {frames} frames of the pattern",
             "repetitions": f"{capture.get('repeat')} in one scan",
